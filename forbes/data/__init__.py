@@ -1,0 +1,1 @@
+"""Data: one DataModule, several sources of sequences."""

@@ -1,0 +1,48 @@
+"""What a data source gives: sequences of observations, addressed by split and index."""
+
+from abc import ABC, abstractmethod
+from typing import Any, Literal, NamedTuple
+
+from torch import Tensor
+
+__all__ = ["SequenceBatch", "SequenceSource", "Split"]
+
+Split = Literal["train", "validation", "test"]
+
+
+class SequenceBatch(NamedTuple):
+    """Sequences, batch first. Index t holds (o_t, a_{t-1}, r_t): the action is the one that led to o_t, zero at the start."""
+
+    observation: Tensor
+    """o_t, uint8 (B, T, C, H, W) for images."""
+    action: Tensor
+    """a_{t-1}, float32 (B, T, A); A may be 0."""
+    reward: Tensor
+    """r_t, float32 (B, T)."""
+    mask: Tensor
+    """True where the step belongs to the sequence, False on padding, bool (B, T)."""
+
+
+class SequenceSource(ABC):
+    """A set of sequences. To add one, copy `strokes.py`: three methods and two numbers.
+
+    `gather` runs on the CPU and returns the most compact tensors that determine the batch (a NamedTuple of tensors);
+    `decode` turns them into a `SequenceBatch` on whatever device they have been moved to.
+    """
+
+    observation_shape: tuple[int, ...]
+    """Shape of one observation, without batch and time."""
+    action_dim: int
+    """A, 0 for a process without actions."""
+
+    @abstractmethod
+    def size(self, split: Split) -> int:
+        """Count the sequences of a split."""
+
+    @abstractmethod
+    def gather(self, split: Split, index: Tensor, length: int) -> Any:
+        """Collect sequences by index, int64 (B,), cut or padded to `length` steps; compact, on the CPU."""
+
+    @abstractmethod
+    def decode(self, compact: Any) -> SequenceBatch:
+        """Turn what `gather` returned into a batch, on the device it lies on."""
