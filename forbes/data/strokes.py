@@ -1,0 +1,151 @@
+"""Sequential MNIST: a digit appears as a pen writes it, frame t showing the first t points of its path."""
+
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from forbes.data.source import SequenceBatch, SequenceSource, Split
+from forbes.data.stroke_file import SIDE, StrokeArrays, load_strokes
+from forbes.errors import ForbesError
+
+__all__ = ["StrokePoints", "Strokes", "bundled_path", "dejong_path"]
+
+
+class StrokePoints(NamedTuple):
+    """The pen paths of some digits, the compact form of their frames."""
+
+    points: Tensor
+    """Pixels (x, y) in writing order, the last one repeated as padding, uint8 (B, T * points_per_step, 2)."""
+    count: Tensor
+    """Points that are no padding, int64 (B,)."""
+
+
+def bundled_path() -> Path:
+    """Find the set that comes with the package: beside this module in a wheel, under `data/` in a checkout."""
+    in_wheel = Path(__file__).with_name("strokes.npz")
+    return in_wheel if in_wheel.is_file() else Path(__file__).parents[2] / "data" / "strokes.npz"
+
+
+def dejong_path() -> Path:
+    """Where the paper's set is stored: `$FORBES_DATA`, else the user's cache."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "forbes"
+    return Path(os.environ.get("FORBES_DATA") or cache) / "dejong-strokes.npz"
+
+
+class Strokes(SequenceSource):
+    r"""MNIST digits as they are written, rendered on the fly from the pen's path.
+
+    Frame t is binary and cumulative: with k points a step, :math:`o_t[y, x] = 1` where one of the first
+    :math:`\min(kt, n)` of the digit's n points is (x, y), t = 1, 2, …. There are no actions and no rewards::
+
+        k = 2, n = 5     t      1     2     3     4
+                         points 1-2   1-4   1-5   1-5
+                         mask   true  true  true  false
+
+    Args:
+        origin: ``bundled``, our own extraction from the MNIST images, comes with the package; ``dejong`` is the
+            paper's set, stored by ``forbes data fetch strokes``.
+        path: Read this file instead of the origin's own.
+        points_per_step: Points that each frame adds. 1 is the paper's; 2 shows 99 % of the digits whole in 30 frames.
+        validation: The last so many training digits are the validation split.
+    """
+
+    observation_shape = (1, SIDE, SIDE)
+    action_dim = 0
+
+    def __init__(
+        self,
+        origin: Literal["bundled", "dejong"] = "bundled",
+        path: str | None = None,
+        points_per_step: int = 1,
+        validation: int = 5000,
+    ) -> None:
+        if points_per_step < 1:
+            raise ForbesError(f"Strokes: points_per_step is {points_per_step}, expected at least 1.")
+        if validation < 0:
+            raise ForbesError(f"Strokes: validation is {validation}, expected at least 0.")
+        self.origin = origin
+        self.path = path
+        self.points_per_step = points_per_step
+        self.validation = validation
+
+    @cached_property
+    def _splits(self) -> dict[Split, StrokeArrays]:
+        """The file's arrays by split, read on first use."""
+        if self.origin == "bundled":
+            path, remedy = bundled_path(), "Rebuild it with: forbes data build-strokes --images DIR"
+        else:
+            path = dejong_path()
+            remedy = "Get it with: forbes data fetch strokes --from PATH, or use the origin bundled"
+        file = load_strokes(Path(self.path) if self.path else path, remedy)
+        digits = len(file["train"].labels)
+        if self.validation >= digits:
+            raise ForbesError(f"Strokes: validation is {self.validation}, expected less than the {digits} digits there.")
+        train, validation = _divide(file["train"], digits - self.validation)
+        return {"train": train, "validation": validation, "test": file["test"]}
+
+    @cached_property
+    def _tensors(self) -> dict[Split, tuple[Tensor, Tensor]]:
+        """Points (P, 2) and offsets (N + 1,) by split."""
+        return {
+            split: (torch.from_numpy(arrays.points), torch.from_numpy(arrays.offsets).long())
+            for split, arrays in self._splits.items()
+        }
+
+    def size(self, split: Split) -> int:
+        """Count the digits of a split."""
+        return len(self._splits[split].labels)
+
+    def arrays(self, split: Split) -> StrokeArrays:
+        """Give a split's pen paths, pen lifts included."""
+        return self._splits[split]
+
+    def labels(self, split: Split) -> Tensor:
+        """Give the class of each digit of a split, int64 (N,)."""
+        return torch.from_numpy(self._splits[split].labels).long()
+
+    def gather(self, split: Split, index: Tensor, length: int) -> StrokePoints:
+        """Collect the paths of digits `index`, int64 (B,), cut or padded to `length` steps."""
+        if length < 1:
+            raise ForbesError(f"Strokes: length is {length}, expected at least 1 step.")
+        points, offsets = self._tensors[split]
+        first = offsets[index]  # (B,)
+        count = (offsets[index + 1] - first).clamp(max=length * self.points_per_step)  # (B,)
+        step = torch.arange(length * self.points_per_step)  # (P,)
+        step = torch.minimum(step, count[:, None] - 1)  # (B, P), stays at the last point
+        return StrokePoints(points[first[:, None] + step], count)  # (B, P, 2), (B,)
+
+    def decode(self, compact: StrokePoints) -> SequenceBatch:
+        """Render frames from points, on the device the points lie on.
+
+        A pixel is on from its first visit onwards, so one comparison of first visits with t gives all frames.
+        """
+        points, count = compact
+        batch, device = len(points), points.device
+        length = points.shape[1] // self.points_per_step
+        time = torch.arange(length, device=device)  # (T,)
+        step = time.repeat_interleave(self.points_per_step).expand(batch, -1)  # (B, P)
+        pixel = points[..., 1].long() * SIDE + points[..., 0]  # (B, P)
+        never = torch.full((batch, SIDE * SIDE), length, device=device)
+        first_visit = never.scatter_reduce(1, pixel, step, "amin")  # (B, H * W)
+        frames = (first_visit[:, None] <= time[:, None]).to(torch.uint8)  # (B, T, H * W)
+        return SequenceBatch(
+            observation=frames.view(batch, length, 1, SIDE, SIDE),  # (B, T, 1, H, W)
+            action=torch.zeros(batch, length, 0, device=device),
+            reward=torch.zeros(batch, length, device=device),
+            mask=time * self.points_per_step < count[:, None],  # (B, T)
+        )
+
+
+def _divide(arrays: StrokeArrays, digits: int) -> tuple[StrokeArrays, StrokeArrays]:
+    """Part the first so many digits from the others."""
+    points, pen_up, offsets, labels = arrays
+    cut = offsets[digits]
+    return (
+        StrokeArrays(points[:cut], pen_up[:cut], offsets[: digits + 1], labels[:digits]),
+        StrokeArrays(points[cut:], pen_up[cut:], offsets[digits:] - cut, labels[digits:]),
+    )
