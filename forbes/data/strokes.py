@@ -20,7 +20,7 @@ class StrokePoints(NamedTuple):
 
     points: Tensor
     """Pixels (x, y) in writing order, the last one repeated as padding, uint8 (B, T * points_per_step, 2)."""
-    count: Tensor
+    number: Tensor
     """Points that are no padding, int64 (B,)."""
 
 
@@ -84,7 +84,7 @@ class Strokes(SequenceSource):
         file = load_strokes(Path(self.path) if self.path else path, remedy)
         digits = len(file["train"].labels)
         if self.validation >= digits:
-            raise ForbesError(f"Strokes: validation is {self.validation}, expected less than the {digits} digits there.")
+            raise ForbesError(f"Strokes: validation is {self.validation}, expected less than the {digits} digits.")
         train, validation = _divide(file["train"], digits - self.validation)
         return {"train": train, "validation": validation, "test": file["test"]}
 
@@ -114,17 +114,17 @@ class Strokes(SequenceSource):
             raise ForbesError(f"Strokes: length is {length}, expected at least 1 step.")
         points, offsets = self._tensors[split]
         first = offsets[index]  # (B,)
-        count = (offsets[index + 1] - first).clamp(max=length * self.points_per_step)  # (B,)
+        number = (offsets[index + 1] - first).clamp(max=length * self.points_per_step)  # (B,)
         step = torch.arange(length * self.points_per_step)  # (P,)
-        step = torch.minimum(step, count[:, None] - 1)  # (B, P), stays at the last point
-        return StrokePoints(points[first[:, None] + step], count)  # (B, P, 2), (B,)
+        step = torch.minimum(step, number[:, None] - 1)  # (B, P), stays at the last point
+        return StrokePoints(points[first[:, None] + step], number)  # (B, P, 2), (B,)
 
     def decode(self, compact: StrokePoints) -> SequenceBatch:
         """Render frames from points, on the device the points lie on.
 
         A pixel is on from its first visit onwards, so one comparison of first visits with t gives all frames.
         """
-        points, count = compact
+        points, number = compact
         batch, device = len(points), points.device
         length = points.shape[1] // self.points_per_step
         time = torch.arange(length, device=device)  # (T,)
@@ -137,7 +137,7 @@ class Strokes(SequenceSource):
             observation=frames.view(batch, length, 1, SIDE, SIDE),  # (B, T, 1, H, W)
             action=torch.zeros(batch, length, 0, device=device),
             reward=torch.zeros(batch, length, device=device),
-            mask=time * self.points_per_step < count[:, None],  # (B, T)
+            mask=time * self.points_per_step < number[:, None],  # (B, T)
         )
 
 
