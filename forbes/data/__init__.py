@@ -1,1 +1,7 @@
 """Data: one DataModule, several sources of sequences."""
+
+from forbes.data.datamodule import SequenceDataModule
+from forbes.data.source import SequenceBatch, SequenceSource, Split
+from forbes.data.strokes import Strokes
+
+__all__ = ["SequenceBatch", "SequenceDataModule", "SequenceSource", "Split", "Strokes"]

@@ -1,0 +1,7 @@
+"""Belief families: conditional densities over the stochastic state, one file each, all through `BeliefHead`."""
+
+from forbes.beliefs.base import BeliefFamily, BeliefHead
+from forbes.beliefs.flow import FlowBelief
+from forbes.beliefs.gaussian import GaussianBelief
+
+__all__ = ["BeliefFamily", "BeliefHead", "FlowBelief", "GaussianBelief"]

@@ -1,0 +1,56 @@
+"""The interface of every belief family: a conditional density over the stochastic state s given a context."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TypeAlias
+
+from torch import Tensor, nn
+
+__all__ = ["BeliefFamily", "BeliefHead", "Sampler"]
+
+Sampler: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
+
+
+class BeliefHead(nn.Module, ABC):
+    r"""A conditional density :math:`p(s \mid c)` over the state given a context (DESIGN §4).
+
+    The context is the hidden layer of the network that reads the history: shape `(*, C)`. A family knows neither the
+    world model nor the likelihood. To add one, copy `gaussian.py` and write `rsample` and `log_prob`.
+
+    Args:
+        state_dim: D, the dimension of s.
+        context_dim: C, the dimension of the context.
+    """
+
+    def __init__(self, state_dim: int, context_dim: int) -> None:
+        super().__init__()
+        self.state_dim = state_dim
+        self.context_dim = context_dim
+
+    @abstractmethod
+    def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+        """Draw s, reparameterised, and its own log-density.
+
+        Args:
+            context: c, shape `(*, C)`.
+            sample_shape: how many independent draws per context.
+
+        Returns:
+            s, shape `(*sample_shape, *, D)`, and log p(s | c) in nats, shape `(*sample_shape, *)`.
+        """
+
+    @abstractmethod
+    def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
+        """Give log p(s | c) in nats, summed over the state: shapes `(*, D)` and `(*, C)` to `(*)`, which broadcast."""
+
+    def sampler(self) -> Sampler:
+        """Prepare `rsample` for a time loop: what does not depend on the context is computed once, here."""
+        return self.rsample
+
+    def kl(self, context: Tensor, prior: "BeliefHead", prior_context: Tensor) -> Tensor | None:
+        r"""Give :math:`D_{KL}(p(\cdot \mid c) \,\|\, prior)` in nats, shape `(*)`, where a closed form exists, else None."""
+        return None
+
+
+BeliefFamily: TypeAlias = Callable[[int, int], BeliefHead]
+"""Builds a head from (state_dim, context_dim): a class of this package with its other arguments bound."""

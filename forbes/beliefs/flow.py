@@ -1,0 +1,56 @@
+"""The flow belief of FORBES (Chen et al., 2022, arXiv 2205.11051, equations of §3.1)."""
+
+import torch
+from torch import Tensor
+
+from forbes.beliefs.base import BeliefHead, Sampler
+from forbes.beliefs.flows import ConditionalFlow
+from forbes.beliefs.gaussian import GaussianBelief, standard_normal_log_prob
+
+__all__ = ["FlowBelief"]
+
+
+class FlowBelief(BeliefHead):
+    r"""A Gaussian pushed through a conditional flow.
+
+    .. math:: s = f(s_0; c), \quad s_0 \sim N(\mu(c), \sigma(c)^2), \qquad
+              \log p(s \mid c) = \log N(s_0; \mu, \sigma^2) - \log\left|\det \partial f / \partial s_0\right|
+
+    At initialisation f is the identity: the belief is exactly `GaussianBelief`.
+
+    Args:
+        state_dim: D, at least 2.
+        context_dim: C.
+        layers: K coupling layers; 5 for DeepMind Control, 3 for digit strokes (paper, appendix).
+        width: width of each coupling network; the paper does not give it.
+        min_std: smallest standard deviation of the base, the same as the Gaussian belief's.
+    """
+
+    def __init__(
+        self, state_dim: int, context_dim: int, layers: int = 5, width: int = 64, min_std: float = 0.1
+    ) -> None:
+        super().__init__(state_dim, context_dim)
+        self.base = GaussianBelief(state_dim, context_dim, min_std)
+        self.flow = ConditionalFlow(state_dim, context_dim, layers, width)
+
+    def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+        """See `BeliefHead.rsample`."""
+        base, log_prob = self.base.rsample(context, sample_shape)
+        state, log_det = self.flow(base, context)
+        return state, log_prob - log_det
+
+    def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
+        """See `BeliefHead.log_prob`."""
+        base, log_det = self.flow.inverse(state, context)
+        return self.base.log_prob(base, context) - log_det
+
+    def sampler(self) -> Sampler:
+        """See `BeliefHead.sampler`: the LU matrices are the same at every step."""
+        prepared = self.flow.prepare()
+
+        def sample(context: Tensor) -> tuple[Tensor, Tensor]:
+            base, log_prob = self.base.rsample(context)
+            state, log_det = self.flow(base, context, prepared)
+            return state, log_prob - log_det
+
+        return sample

@@ -1,0 +1,55 @@
+"""The Gaussian belief of the RSSM (Hafner et al., 2019, arXiv 1811.04551)."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from forbes.beliefs.base import BeliefHead
+
+__all__ = ["GaussianBelief", "standard_normal_log_prob"]
+
+
+def standard_normal_log_prob(noise: Tensor) -> Tensor:
+    """Give log N(ε; 0, I) in nats, summed over the last dimension: shape `(*, D)` to `(*)`."""
+    return -0.5 * (noise.square().sum(-1) + noise.shape[-1] * math.log(2 * math.pi))
+
+
+class GaussianBelief(BeliefHead):
+    r"""Diagonal Gaussian: :math:`p(s \mid c) = N(s; \mu(c), \mathrm{diag}\,\sigma(c)^2)`, :math:`\sigma = \mathrm{softplus}(\cdot) + \sigma_{min}`.
+
+    Args:
+        state_dim: D.
+        context_dim: C.
+        min_std: smallest standard deviation; 0.1 as in PlaNet and Dreamer.
+    """
+
+    def __init__(self, state_dim: int, context_dim: int, min_std: float = 0.1) -> None:
+        super().__init__(state_dim, context_dim)
+        self.min_std = min_std
+        self.parameters_of = nn.Linear(context_dim, 2 * state_dim)
+
+    def moments(self, context: Tensor) -> tuple[Tensor, Tensor]:
+        """Give mean and standard deviation, each `(*, D)`."""
+        mean, raw_std = self.parameters_of(context).float().chunk(2, -1)  # 2 x (*, D)
+        return mean, softplus(raw_std) + self.min_std
+
+    def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+        """See `BeliefHead.rsample`."""
+        mean, std = self.moments(context)
+        noise = torch.randn(*sample_shape, *mean.shape, dtype=mean.dtype, device=mean.device)  # (*sample_shape, *, D)
+        return mean + std * noise, standard_normal_log_prob(noise) - std.log().sum(-1)
+
+    def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
+        """See `BeliefHead.log_prob`."""
+        mean, std = self.moments(context)
+        return standard_normal_log_prob((state - mean) / std) - std.log().sum(-1)
+
+    def kl(self, context: Tensor, prior: BeliefHead, prior_context: Tensor) -> Tensor | None:
+        r"""Closed form between two Gaussians: :math:`\sum_d \log\frac{\sigma_p}{\sigma_q} + \frac{\sigma_q^2 + (\mu_q-\mu_p)^2}{2\sigma_p^2} - \frac12`."""
+        if not isinstance(prior, GaussianBelief):
+            return None
+        (mean, std), (prior_mean, prior_std) = self.moments(context), prior.moments(prior_context)
+        ratio, shift = std / prior_std, (mean - prior_mean) / prior_std
+        return (0.5 * (ratio.square() + shift.square() - 1) - ratio.log()).sum(-1)

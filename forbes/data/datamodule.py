@@ -1,0 +1,144 @@
+"""The DataModule: batches of sequences from any source, each a pure function of (seed, update)."""
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any
+
+import torch
+from lightning import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset
+
+from forbes.data.source import SequenceBatch, SequenceSource, Split
+from forbes.errors import ForbesError
+from forbes.seeding import generator
+
+__all__ = ["SequenceDataModule"]
+
+
+class _Batches(IterableDataset[Any]):
+    """Compact batches of a split, from a list of indices per batch."""
+
+    def __init__(self, source: SequenceSource, split: Split, length: int, indices: Any) -> None:
+        self.source, self.split, self.length, self.indices = source, split, length, indices
+
+    def __iter__(self) -> Iterator[Any]:
+        return (self.source.gather(self.split, index, self.length) for index in self.indices)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+class _TrainIndices:
+    """Indices of the batches from the trainer's update on: shuffled passes over the split, without replacement."""
+
+    def __init__(self, datamodule: "SequenceDataModule") -> None:
+        self.datamodule = datamodule
+
+    def __iter__(self) -> Iterator[Tensor]:
+        trainer = self.datamodule.trainer
+        first = trainer.global_step if trainer is not None else 0
+        return (self.datamodule.train_index(update) for update in range(first, first + len(self)))
+
+    def __len__(self) -> int:
+        return self.datamodule.updates_per_epoch
+
+
+class SequenceDataModule(LightningDataModule):
+    """Batches of `SequenceBatch` from a source; images stay uint8 until they are on the device.
+
+    Batch i of the training is a pure function of (seed, i): a resumed run goes on with the batch it would have had,
+    and no loader or RNG state is stored. An epoch is a number of updates, not a pass over the data.
+
+    Args:
+        source: where the sequences come from, e.g. `Strokes`.
+        batch_size: B.
+        length: T; sequences are cut or padded to it.
+        updates_per_epoch: batches between two validations and checkpoints.
+        seed: of the order of the training batches.
+        validation_sequences: how many of the validation split are used after each epoch, from its beginning.
+
+    Raises:
+        ForbesError: when `length` or `batch_size` is below 1, or a batch is larger than its split.
+    """
+
+    def __init__(
+        self,
+        source: SequenceSource,
+        batch_size: int = 50,
+        length: int = 50,
+        updates_per_epoch: int = 100,
+        seed: int = 0,
+        validation_sequences: int = 1000,
+    ) -> None:
+        super().__init__()
+        for name, value in [
+            ("batch_size", batch_size),
+            ("length", length),
+            ("updates_per_epoch", updates_per_epoch),
+            ("validation_sequences", validation_sequences),
+        ]:
+            if value < 1:
+                raise ForbesError(f"SequenceDataModule: {name} is {value}, expected at least 1")
+        self.source, self.batch_size, self.length, self.seed = source, batch_size, length, seed
+        self.updates_per_epoch = updates_per_epoch
+        self.validation_sequences = validation_sequences
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        """Shape of one observation."""
+        return self.source.observation_shape
+
+    @property
+    def action_dim(self) -> int:
+        """A."""
+        return self.source.action_dim
+
+    def train_index(self, update: int) -> Tensor:
+        """Give the indices of one training batch, `(B,)`, int64."""
+        size = self.source.size("train")
+        if self.batch_size > size:
+            raise ForbesError(
+                f"SequenceDataModule: batch_size is {self.batch_size}, but the training split has {size} sequences. "
+                "Choose a smaller batch_size"
+            )
+        turn, place = divmod(update, size // self.batch_size)
+        return _order(self.seed, turn, size)[place * self.batch_size : (place + 1) * self.batch_size]  # (B,)
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Give `updates_per_epoch` batches, from the trainer's current update on."""
+        return self._loader("train", _TrainIndices(self))
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        """Give the first `validation_sequences` of the validation split, in order."""
+        return self._ordered("validation", self.validation_sequences)
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        """Give the whole test split, in order."""
+        return self._ordered("test", None)
+
+    def predict_dataloader(self) -> DataLoader[Any]:
+        """Give the whole test split, in order."""
+        return self.test_dataloader()
+
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> SequenceBatch:
+        """Decode on the device."""
+        return self.source.decode(batch)
+
+    def sequences(self, split: Split, index: Tensor, length: int | None = None) -> SequenceBatch:
+        """Give chosen sequences of a split on the CPU, cut or padded to `length` (the module's own by default)."""
+        return self.source.decode(self.source.gather(split, index, length or self.length))
+
+    def _ordered(self, split: Split, limit: int | None) -> DataLoader[Any]:
+        size = self.source.size(split)
+        return self._loader(split, torch.arange(min(limit or size, size)).split(4 * self.batch_size))
+
+    def _loader(self, split: Split, indices: Any) -> DataLoader[Any]:
+        # A batch is gathered in less time than a worker process needs to hand it over.
+        return DataLoader(_Batches(self.source, split, self.length, indices), batch_size=None)
+
+
+@lru_cache(maxsize=2)
+def _order(seed: int, turn: int, size: int) -> Tensor:
+    """Shuffle a split for one pass over it."""
+    return torch.randperm(size, generator=generator(seed, "order", turn))

@@ -1,0 +1,63 @@
+"""The evidence lower bound of a recurrent belief model and the loss that trains it (paper, equation of §3.1)."""
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["ElboTerms", "FreeNats", "elbo_loss"]
+
+FreeNats = Literal["batch", "element"]
+
+
+class ElboTerms(NamedTuple):
+    r"""The parts of the bound, per step, in nats.
+
+    .. math:: J = \sum_t \log p(o_t \mid h_t, s_t) - \left(\log q_K(s_t) - \log p_K(s_t)\right), \quad s_t \sim q_K
+    """
+
+    reconstruction: Tensor
+    """log p(o_t | features), `(B, T)`."""
+    kl: Tensor
+    """log q(s_t) - log p(s_t) at the posterior's own sample, `(B, T)`: the estimator that is reported for every family."""
+    analytic_kl: Tensor | None
+    """The closed form of its expectation given (h_t, e_t), `(B, T)`, where the family has one."""
+    mask: Tensor
+    """True where the step counts, `(B, T)`."""
+
+    @property
+    def elbo(self) -> Tensor:
+        """J per sequence, padding left out, shape `(B,)`."""
+        return ((self.reconstruction - self.kl) * self.mask).sum(1)
+
+    def mean_over_steps(self, values: Tensor) -> Tensor:
+        """Average `(B, T)` over the steps that count."""
+        return (values * self.mask).sum() / self.mask.sum()
+
+
+def elbo_loss(
+    terms: ElboTerms, free_nats: float = 0.0, free_nats_per: FreeNats = "batch", kl_weight: float | Tensor = 1.0
+) -> Tensor:
+    r"""Negative bound per step, with free nats.
+
+    .. math:: L = -\overline{\log p(o_t)} + \beta \max(\overline{KL_t},\, n), \quad\text{or}\quad \beta\,\overline{\max(KL_t, n)}
+
+    The bar is the mean over batch and time, padding left out. The KL is the closed form where the terms have one.
+    Free nats and the weight are for the loss only; a reported bound never has them.
+
+    Args:
+        terms: the parts of the bound.
+        free_nats: n, in nats per step.
+        free_nats_per: "batch" averages first (Dreamer, ours), "element" clips each step (PlaNet).
+        kl_weight: :math:`\beta`, 1 but for a warm-up.
+
+    Returns:
+        L in nats per step, a scalar.
+    """
+    kl = terms.kl if terms.analytic_kl is None else terms.analytic_kl
+    if free_nats_per == "element":
+        divergence = terms.mean_over_steps(kl.clamp(min=free_nats))
+    else:
+        divergence = terms.mean_over_steps(kl)
+        divergence = torch.clamp(divergence, min=free_nats) if free_nats > 0 else divergence
+    return kl_weight * divergence - terms.mean_over_steps(terms.reconstruction)

@@ -1,0 +1,145 @@
+"""Networks of the world model: perceptrons, image encoders and decoders (paper, appendix: Dreamer's)."""
+
+import math
+from collections.abc import Callable
+from typing import TypeAlias
+
+from torch import Tensor, nn
+
+from forbes.errors import ForbesError
+
+__all__ = ["ConvDecoder", "ConvEncoder", "Decoder", "Encoder", "MLPDecoder", "MLPEncoder", "perceptron"]
+
+
+def perceptron(input_dim: int, width: int, layers: int) -> nn.Sequential:
+    """Build `layers` linear layers of `width`, each followed by a ReLU."""
+    dims = [input_dim] + [width] * layers
+    blocks = [nn.Sequential(nn.Linear(a, b), nn.ReLU()) for a, b in zip(dims[:-1], dims[1:], strict=True)]
+    return nn.Sequential(*blocks)
+
+
+class Encoder(nn.Module):
+    """e_t = encoder(o_t): images `(N, C, H, W)` to embeddings `(N, E)`.
+
+    Attributes:
+        embedding_dim: E.
+    """
+
+    embedding_dim: int
+
+
+class Decoder(nn.Module):
+    """Features `(N, F)` to the likelihood's parameters `(N, C, H, W)`."""
+
+
+EncoderFamily: TypeAlias = Callable[[tuple[int, ...]], Encoder]
+"""Builds an encoder from the observation's shape."""
+DecoderFamily: TypeAlias = Callable[[int, tuple[int, ...]], Decoder]
+"""Builds a decoder from (feature_dim, observation_shape)."""
+
+
+class MLPEncoder(Encoder):
+    """Perceptron on flattened pixels: by far the cheapest encoder of small frames on a CPU.
+
+    Args:
+        observation_shape: (C, H, W).
+        width: width of each layer, and E.
+        layers: how many.
+    """
+
+    def __init__(self, observation_shape: tuple[int, ...], width: int = 200, layers: int = 2) -> None:
+        super().__init__()
+        self.embedding_dim = width
+        self.net = perceptron(math.prod(observation_shape), width, layers)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """See `Encoder`."""
+        embedding: Tensor = self.net(observation.flatten(1))  # (N, E)
+        return embedding
+
+
+class MLPDecoder(Decoder):
+    """Perceptron to pixels.
+
+    Args:
+        feature_dim: F.
+        observation_shape: (C, H, W).
+        width: width of each hidden layer.
+        layers: how many hidden layers.
+    """
+
+    def __init__(
+        self, feature_dim: int, observation_shape: tuple[int, ...], width: int = 200, layers: int = 2
+    ) -> None:
+        super().__init__()
+        self.observation_shape = observation_shape
+        self.net = nn.Sequential(
+            perceptron(feature_dim, width, layers), nn.Linear(width, math.prod(observation_shape))
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """See `Decoder`."""
+        output: Tensor = self.net(features)
+        return output.unflatten(-1, self.observation_shape)  # (N, C, H, W)
+
+
+class ConvEncoder(Encoder):
+    """Dreamer's encoder: convolutions of kernel 4 and stride 2, doubling the channels, until less than 4 pixels are left.
+
+    64 pixels: 64-31-14-6-2, E = 1024 at 32 channels. 28 pixels: 28-13-5-1, E = 128.
+
+    Args:
+        observation_shape: (C, H, W).
+        channels: of the first layer.
+    """
+
+    def __init__(self, observation_shape: tuple[int, ...], channels: int = 32) -> None:
+        super().__init__()
+        depth, size, _ = observation_shape
+        blocks: list[nn.Module] = []
+        while size >= 4:
+            blocks += [nn.Conv2d(depth, channels, 4, stride=2), nn.ReLU()]
+            depth, channels, size = channels, 2 * channels, (size - 4) // 2 + 1
+        self.net = nn.Sequential(*blocks)
+        self.embedding_dim = depth * size * size
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """See `Encoder`."""
+        maps: Tensor = self.net(observation)
+        return maps.flatten(1)  # (N, E)
+
+
+class ConvDecoder(Decoder):
+    """Dreamer's decoder: a linear layer, then transposed convolutions of stride 2 from one pixel up.
+
+    64 pixels: kernels 5, 5, 6, 6 (1-5-13-30-64). 28 pixels: kernels 5, 5, 4 (1-5-13-28).
+
+    Args:
+        feature_dim: F.
+        observation_shape: (C, H, W), H = W = 64 or 28.
+        channels: of the last hidden layer; each layer before has twice as many.
+
+    Raises:
+        ForbesError: for another size.
+    """
+
+    kernels = {64: (5, 5, 6, 6), 28: (5, 5, 4)}
+
+    def __init__(self, feature_dim: int, observation_shape: tuple[int, ...], channels: int = 32) -> None:
+        super().__init__()
+        depth, size, _ = observation_shape
+        if size not in self.kernels:
+            raise ForbesError(f"ConvDecoder: observations have {size} pixels, expected 28 or 64. Use MLPDecoder")
+        kernels = self.kernels[size]
+        widths = [channels * 2 ** (len(kernels) - k - 1) for k in range(1, len(kernels))] + [depth]
+        self.start_dim = channels * 2 ** len(kernels)
+        self.start = nn.Linear(feature_dim, self.start_dim)
+        blocks: list[nn.Module] = []
+        for before, after, kernel in zip([self.start_dim, *widths[:-1]], widths, kernels, strict=True):
+            blocks += [nn.ConvTranspose2d(before, after, kernel, stride=2), nn.ReLU()]
+        self.net = nn.Sequential(*blocks[:-1])
+
+    def forward(self, features: Tensor) -> Tensor:
+        """See `Decoder`."""
+        output: Tensor = self.net(self.start(features).unflatten(-1, (self.start_dim, 1, 1)))  # (N, C, H, W)
+        return output

@@ -1,0 +1,201 @@
+r"""The recurrent state-space model: filter a sequence, imagine its future, decode both (DESIGN §5, paper §3.1).
+
+.. math::
+
+    y_t = \mathrm{MLP}(s_{t-1}, a_{t-1}), \quad h_t = \mathrm{GRU}(h_{t-1}, y_t), \quad (h_0, s_0) = 0 \\
+    \text{prior } p(s_t \mid h_t), \qquad \text{posterior } q(s_t \mid h_t, e_t), \quad e_t = \mathrm{encoder}(o_t)
+
+Only the posterior's sample feeds the recurrence. So the time loop holds the transition, the GRU and the posterior;
+the encoder runs before it, the prior and the decoder after it, once over (B·T).
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import linear
+
+from forbes.beliefs import BeliefFamily, BeliefHead
+from forbes.models.elbo import ElboTerms
+from forbes.models.likelihoods import Likelihood
+from forbes.models.networks import Decoder, Encoder, perceptron
+
+__all__ = ["Filtered", "Rollout", "State", "StateSpaceModel"]
+
+
+class State(NamedTuple):
+    """What the recurrence carries."""
+
+    hidden: Tensor
+    """h, `(*, H)`."""
+    state: Tensor
+    """s, `(*, D)`."""
+
+
+class Rollout(NamedTuple):
+    """A trajectory of the prior."""
+
+    hidden: Tensor
+    """h_t, `(B, T, H)`."""
+    state: Tensor
+    """s_t, drawn from the prior, `(B, T, D)`."""
+    log_prob: Tensor
+    """log p(s_t | h_t) in nats, `(B, T)`."""
+
+    @property
+    def features(self) -> Tensor:
+        """[h_t, s_t], the input of every decoder, `(B, T, H + D)`."""
+        return torch.cat((self.hidden, self.state), -1)  # (B, T, H + D)
+
+
+class Filtered(NamedTuple):
+    """A trajectory of the posterior, with what the bound and further samples need."""
+
+    hidden: Tensor
+    """h_t, `(B, T, H)`."""
+    state: Tensor
+    """s_t, drawn from the posterior, `(B, T, D)`."""
+    context: Tensor
+    """The posterior's context of (h_t, e_t), `(B, T, C)`."""
+    log_prob: Tensor
+    """log q(s_t | h_t, e_t) in nats, `(B, T)`."""
+
+    @property
+    def features(self) -> Tensor:
+        """[h_t, s_t], the input of every decoder, `(B, T, H + D)`."""
+        return torch.cat((self.hidden, self.state), -1)  # (B, T, H + D)
+
+    def at(self, time: int) -> State:
+        """Give the state at one step, to go on from."""
+        return State(self.hidden[:, time], self.state[:, time])  # (B, H), (B, D)
+
+
+class StateSpaceModel(nn.Module):
+    """RSSM with any belief family: Gaussian gives PlaNet's and Dreamer's, flow gives FORBES.
+
+    Args:
+        belief: builds the prior's and the posterior's head from (state_dim, context_dim).
+        encoder: o_t to e_t.
+        decoder: features to the likelihood's parameters; its input has `hidden_dim + state_dim` dimensions.
+        likelihood: what the decoder's output means.
+        action_dim: A, may be 0.
+        state_dim: D of s.
+        hidden_dim: H of h.
+        mlp_dim: width of every perceptron, and C of the belief's contexts.
+        mlp_layers: layers of every perceptron.
+    """
+
+    def __init__(
+        self,
+        belief: BeliefFamily,
+        encoder: Encoder,
+        decoder: Decoder,
+        likelihood: Likelihood,
+        action_dim: int,
+        state_dim: int,
+        hidden_dim: int,
+        mlp_dim: int,
+        mlp_layers: int,
+    ) -> None:
+        super().__init__()
+        self.state_dim, self.hidden_dim = state_dim, hidden_dim
+        self.encoder, self.decoder, self.likelihood = encoder, decoder, likelihood
+        self.transition = perceptron(state_dim + action_dim, mlp_dim, mlp_layers)
+        self.gru = nn.GRUCell(mlp_dim, hidden_dim)
+        self.prior_context = perceptron(hidden_dim, mlp_dim, mlp_layers)
+        self.posterior_context = perceptron(hidden_dim + encoder.embedding_dim, mlp_dim, mlp_layers)
+        self.prior: BeliefHead = belief(state_dim, mlp_dim)
+        self.posterior: BeliefHead = belief(state_dim, mlp_dim)
+
+    def initial(self, batch: int) -> State:
+        """Give (h_0, s_0) = 0."""
+        weight = self.gru.weight_hh
+        return State(weight.new_zeros(batch, self.hidden_dim), weight.new_zeros(batch, self.state_dim))
+
+    def embed(self, observation: Tensor) -> Tensor:
+        """Encode every frame: stored observations `(B, T, C, H, W)` to e `(B, T, E)`."""
+        embedding: Tensor = self.encoder(self.likelihood.target(observation).flatten(0, 1))  # (B T, E)
+        return embedding.unflatten(0, observation.shape[:2])  # (B, T, E)
+
+    def filter(self, embedding: Tensor, action: Tensor, start: State | None = None) -> Filtered:
+        """Run the posterior along a sequence.
+
+        Args:
+            embedding: e_t, `(B, T, E)`.
+            action: a_{t-1}, the action that led to o_t, `(B, T, A)`.
+            start: where to go on from; (h_0, s_0) = 0 by default.
+
+        Returns:
+            One trajectory of (h_t, s_t) per sequence. A prefix of the input gives the prefix of the output (for
+            the same noise): nothing looks ahead.
+        """
+        hidden, state = start or self.initial(len(embedding))
+        of_state, of_action = self._split(self.transition, self.state_dim)
+        of_hidden, of_embedding = self._split(self.posterior_context, self.hidden_dim)
+        # What does not depend on the recurrence is one matmul over all steps, before the loop.
+        action_shares = linear(action, of_action, self.transition[0][0].bias).unbind(1)  # T x (B, M)
+        embedding_shares = linear(embedding, of_embedding, self.posterior_context[0][0].bias).unbind(1)  # T x (B, M)
+        sample = self.posterior.sampler()
+
+        steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+        for action_share, embedding_share in zip(action_shares, embedding_shares, strict=True):
+            inputs = self.transition[1:](torch.addmm(action_share, state, of_state.T).relu())
+            hidden = self.gru(inputs, hidden)
+            context = self.posterior_context[1:](torch.addmm(embedding_share, hidden, of_hidden.T).relu())
+            state, log_prob = sample(context)
+            steps.append((hidden, state, context, log_prob))
+        return Filtered(*(torch.stack(values, 1) for values in zip(*steps, strict=True)))  # (B, T, ...)
+
+    def prior_log_prob(self, filtered: Filtered) -> Tensor:
+        """Give log p(s_t | h_t) of the posterior's samples in nats, `(B, T)`."""
+        return self.prior.log_prob(filtered.state, self.prior_context(filtered.hidden))
+
+    def imagine(self, start: State, action: Tensor) -> Rollout:
+        """Roll the prior on from `start`, each row on its own trajectory.
+
+        Args:
+            start: (h, s), `(B, ...)`; `beliefs` gives several per history.
+            action: a of each step, the one that leads to it, `(B, T, A)`.
+
+        Returns:
+            T steps after `start`, which itself is not among them.
+        """
+        hidden, state = start
+        sample = self.prior.sampler()
+        steps: list[tuple[Tensor, Tensor, Tensor]] = []
+        for step_action in action.unbind(1):
+            hidden = self.gru(self.transition(torch.cat((state, step_action), -1)), hidden)
+            state, log_prob = sample(self.prior_context(hidden))
+            steps.append((hidden, state, log_prob))
+        return Rollout(*(torch.stack(values, 1) for values in zip(*steps, strict=True)))  # (B, T, ...)
+
+    def beliefs(self, filtered: Filtered, time: int, samples: int) -> State:
+        """Draw N samples of each belief q(s_t | h_t, e_t) at one step: `(N B, ...)`, sample-major."""
+        state, _ = self.posterior.rsample(filtered.context[:, time], (samples,))  # (N, B, D)
+        hidden = filtered.hidden[:, time].expand(samples, -1, -1)  # (N, B, H)
+        return State(hidden.flatten(0, 1), state.flatten(0, 1))  # (N B, H), (N B, D)
+
+    def decode(self, features: Tensor) -> Tensor:
+        """Give the likelihood's parameters: features `(*, H + D)` to `(*, C, H, W)`."""
+        output: Tensor = self.decoder(features.flatten(0, -2))  # (N, C, H, W)
+        return output.unflatten(0, features.shape[:-1])  # (*, C, H, W)
+
+    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
+        """Estimate the bound with one posterior trajectory per sequence; arguments as in `SequenceBatch`."""
+        filtered = self.filter(self.embed(observation), action)
+        prior_context = self.prior_context(filtered.hidden)  # (B, T, C)
+        log_likelihood = self.likelihood.log_prob(
+            self.decode(filtered.features).float(), self.likelihood.target(observation)
+        )
+        return ElboTerms(
+            reconstruction=log_likelihood,
+            kl=filtered.log_prob - self.prior.log_prob(filtered.state, prior_context),
+            analytic_kl=self.posterior.kl(filtered.context, self.prior, prior_context),
+            mask=mask,
+        )
+
+    @staticmethod
+    def _split(network: nn.Sequential, cut: int) -> tuple[Tensor, Tensor]:
+        """Cut the first layer's weight: the share of its first `cut` inputs and that of the others."""
+        weight: Tensor = network[0][0].weight
+        return weight[:, :cut], weight[:, cut:]  # (M, cut), (M, rest)

@@ -1,0 +1,140 @@
+"""The world model as a LightningModule: it optimises and logs; the mathematics is in `forbes.models`."""
+
+import math
+from typing import Any, Literal
+
+import torch
+from lightning import LightningModule
+from torch import Tensor
+from torch.optim import Adam, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from forbes.beliefs import BeliefFamily, FlowBelief
+from forbes.data import SequenceBatch
+from forbes.models.elbo import ElboTerms, FreeNats, elbo_loss
+from forbes.models.likelihoods import Likelihood, Normal
+from forbes.models.networks import ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily
+from forbes.models.state_space import StateSpaceModel
+from forbes.seeding import derive_seed
+
+__all__ = ["WorldModel"]
+
+
+class WorldModel(LightningModule):
+    """Learns a belief state model of sequences by the ELBO (paper §3.1). Defaults are the paper's for DeepMind Control.
+
+    Args:
+        belief: the family of prior and posterior, a class of `forbes.beliefs` with its own arguments.
+        encoder: o_t to e_t, a class of `forbes.models.networks`.
+        decoder: features to the likelihood's parameters, likewise.
+        likelihood: what the decoder's output means; `Normal()` by default.
+        observation_shape: of one observation; the command line takes it from the data.
+        action_dim: A; likewise.
+        state_dim: D of s.
+        hidden_dim: H of the GRU.
+        mlp_dim: width of every perceptron.
+        mlp_layers: layers of every perceptron.
+        kl: "analytic" trains with the closed form where the family has one, "monte_carlo" never.
+        free_nats: the KL below this, in nats per step, costs nothing in training.
+        free_nats_per: "batch" applies them to the mean over batch and time, "element" to each step.
+        kl_warmup: updates over which the weight of the KL rises from 0 to 1.
+        learning_rate: of Adam (eps 1e-7).
+        schedule: "constant", or "cosine" to 0 at the end of the training.
+        clip_norm: gradients are scaled down to this norm.
+        seed: of the noise of training and validation.
+    """
+
+    def __init__(
+        self,
+        belief: BeliefFamily = FlowBelief,
+        encoder: EncoderFamily = ConvEncoder,
+        decoder: DecoderFamily = ConvDecoder,
+        likelihood: Likelihood | None = None,
+        observation_shape: tuple[int, ...] = (3, 64, 64),
+        action_dim: int = 0,
+        state_dim: int = 30,
+        hidden_dim: int = 200,
+        mlp_dim: int = 200,
+        mlp_layers: int = 2,
+        kl: Literal["analytic", "monte_carlo"] = "analytic",
+        free_nats: float = 3.0,
+        free_nats_per: FreeNats = "batch",
+        kl_warmup: int = 0,
+        learning_rate: float = 5e-4,
+        schedule: Literal["constant", "cosine"] = "constant",
+        clip_norm: float = 100.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.model = StateSpaceModel(
+            belief,
+            encoder(observation_shape),
+            decoder(hidden_dim + state_dim, observation_shape),
+            likelihood or Normal(),
+            action_dim,
+            state_dim,
+            hidden_dim,
+            mlp_dim,
+            mlp_layers,
+        )
+        self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
+        self.learning_rate, self.schedule, self.clip_norm, self.seed = learning_rate, schedule, clip_norm, seed
+
+    def terms(self, batch: SequenceBatch) -> ElboTerms:
+        """Estimate the parts of the bound on a batch."""
+        return self.model.elbo(batch.observation, batch.action, batch.mask)
+
+    def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
+        """Seed the noise of this update, so that a resumed run draws the same."""
+        torch.manual_seed(derive_seed(self.seed, "update", self.global_step))
+
+    def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
+        """Give the loss of one update; logs the bound without free nats and its parts, per sequence."""
+        terms = self.terms(batch)
+        if self.kl == "monte_carlo":
+            terms = terms._replace(analytic_kl=None)
+        weight = min(1.0, (self.global_step + 1) / self.kl_warmup) if self.kl_warmup else 1.0
+        self._log("train", terms)
+        return elbo_loss(terms, self.free_nats, self.free_nats_per, weight)
+
+    def on_validation_epoch_start(self) -> None:
+        """Seed the noise of a validation, the same each time."""
+        torch.manual_seed(derive_seed(self.seed, "validation", 0))
+
+    def validation_step(self, batch: SequenceBatch, batch_idx: int) -> None:
+        """Log the bound of the validation split with one sample."""
+        self._log("val", self.terms(batch))
+
+    def test_step(self, batch: SequenceBatch, batch_idx: int) -> None:
+        """Log the bound of the test split with one sample; `forbes evaluate` is the careful way."""
+        self._log("test", self.terms(batch))
+
+    def predict_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
+        """Give the bound of each sequence in nats, `(B,)`, with one sample."""
+        return self.terms(batch).elbo
+
+    def configure_optimizers(self) -> Any:
+        """Adam with the paper's rate; fused, since a step over many small tensors is bound by calls."""
+        optimizer = Adam(self.parameters(), lr=self.learning_rate, eps=1e-7, fused=True)
+        if self.schedule == "constant":
+            return optimizer
+        total = self.trainer.estimated_stepping_batches
+        scheduler = LambdaLR(optimizer, lambda update: 0.5 * (1 + math.cos(math.pi * min(1.0, update / total))))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def configure_gradient_clipping(
+        self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
+    ) -> None:
+        """Clip to `clip_norm` and log the norm before."""
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters(), self.clip_norm, foreach=True)
+        self.log("train/gradient_norm", norm)
+
+    def _log(self, split: str, terms: ElboTerms) -> None:
+        """Log per-sequence means in nats; the bound's name holds its likelihood and number of samples."""
+        count = len(terms.mask)
+        values = {
+            f"{split}/elbo[{self.model.likelihood.name},S=1]": terms.elbo.mean(),
+            f"{split}/reconstruction": (terms.reconstruction * terms.mask).sum(1).mean(),
+            f"{split}/kl": (terms.kl * terms.mask).sum(1).mean(),
+        }
+        self.log_dict({name: value.detach() for name, value in values.items()}, batch_size=count)
