@@ -1,0 +1,115 @@
+"""The command `forbes`: lists what there is, hands over to the command asked for, and prints errors as one sentence."""
+
+import difflib
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from forbes import __version__
+from forbes.errors import ForbesError
+
+__all__ = ["main"]
+
+
+class Command(NamedTuple):
+    """What a command does, how one calls it, and the function that runs it: `module:function(arguments)`."""
+
+    summary: str
+    example: str
+    target: str
+
+
+_TRAINED = "--config RUN/config.yaml --ckpt_path RUN/checkpoints/last.ckpt"
+COMMANDS = {
+    "fit": Command("train a model", "--config configs/strokes/forbes.yaml", "forbes.training.commands:fit"),
+    "validate": Command("run the validation loop of a model", _TRAINED, "forbes.training.commands:validate"),
+    "test": Command("run the test loop of a model", _TRAINED, "forbes.training.commands:test"),
+    "predict": Command("run the prediction loop of a model", _TRAINED, "forbes.training.commands:predict"),
+    "evaluate": Command("measure trained models and compare them", "RUN RUN", "forbes.evaluation.commands:main"),
+    "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.figures.commands:main"),
+    "data": Command("fetch, build and look at data", "show strokes -o strokes.png", "forbes.data.commands:main"),
+    "doctor": Command("say what this machine has and lacks", "", "forbes.doctor:main"),
+}
+
+HELP = """\
+usage: forbes COMMAND ...
+
+Learn, measure and use belief states of partially observable processes.
+
+commands, each with an example (RUN is a folder that `forbes fit` has made):
+{commands}
+options:
+  --help               this page; after a command, its own
+  --version            the version
+  --debug              with any command: show the traceback of an error
+  --allow-module NAME  with any command: let configurations name classes of this Python module too
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and give its exit status: 0, 2 for an error the user can mend, 130 or 143 for a signal.
+
+    Args:
+        arguments: without the program's name; those of the process by default.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in arguments
+    try:
+        return _run([argument for argument in arguments if argument != "--debug"])
+    except (ForbesError, OSError) as error:
+        if debug:
+            raise
+        print(f"forbes: {_sentence(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        if debug:
+            raise
+        return 130
+
+
+def _run(arguments: list[str]) -> int:
+    """Answer --help and --version, or hand over."""
+    modules = _take_modules(arguments)
+    if not arguments or arguments[0] in ("--help", "-h", "help"):
+        print(_help(), end="")
+        return 0
+    if arguments[0] == "--version":
+        print(f"forbes {__version__}")
+        return 0
+    if arguments[0] not in COMMANDS:
+        near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
+        hint = f"Did you mean {near[0]}?" if near else f"There are {', '.join(COMMANDS)}"
+        raise ForbesError(f"{arguments[0]}: no such command. {hint}")
+    if modules:
+        importlib.import_module("forbes.training.configuration").allow_modules(modules)
+    module, function = COMMANDS[arguments[0]].target.split(":")
+    command: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
+    return command(arguments[1:]) or 0
+
+
+def _take_modules(arguments: list[str]) -> list[str]:
+    """Remove each `--allow-module NAME` from the arguments and give the names."""
+    modules = []
+    while "--allow-module" in arguments:
+        place = arguments.index("--allow-module")
+        if place + 1 == len(arguments):
+            raise ForbesError("--allow-module: no name follows. Name a Python module")
+        modules.append(arguments[place + 1])
+        del arguments[place : place + 2]
+    return modules
+
+
+def _help() -> str:
+    """List the commands."""
+    rows = []
+    for name, command in COMMANDS.items():
+        rows += [f"  {name:<9} {command.summary}", f"            forbes {name} {command.example}".rstrip(), ""]
+    return HELP.format(commands="\n".join(rows))
+
+
+def _sentence(error: Exception) -> str:
+    """Say a missing file and the like as shortly as our own errors."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {(error.strerror or type(error).__name__).lower()}"
+    return str(error)

@@ -1,0 +1,83 @@
+"""The command `forbes doctor`: what this machine has and lacks, each lack with its remedy."""
+
+import os
+import platform
+import shutil
+from collections.abc import Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import NamedTuple
+
+import torch
+from rich.console import Console
+from rich.table import Column, Table
+
+import forbes
+from forbes.data.strokes import bundled_path, dejong_path
+from forbes.errors import ForbesError
+
+__all__ = ["main"]
+
+REQUIRED = ("torch", "lightning", "jsonargparse", "torchmetrics", "numpy", "matplotlib", "pandas")
+OPTIONAL = {"scikit-image": "build", "tensorboard": "tracking", "dm-control": "dmc"}
+
+
+class Finding(NamedTuple):
+    """One line of the report."""
+
+    name: str
+    value: str
+    remedy: str = ""
+    """What to do; empty where all is well."""
+    fatal: bool = False
+    """True where `make fit` cannot work."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the report; 0 when `make fit` can work here, else 1."""
+    if arguments:
+        if arguments[0] in ("--help", "-h"):
+            print("usage: forbes doctor\n\nSay what this machine has and lacks, each lack with its remedy.")
+            return 0
+        raise ForbesError(f"doctor: takes no arguments, got {' '.join(arguments)}. Call it without")
+    table = Table("", Column("found", overflow="fold"), Column("what to do", overflow="fold"), box=None)
+    findings = [*_software(), *_hardware(), *_data()]
+    for finding in findings:
+        table.add_row(finding.name, finding.value, finding.remedy)
+    Console().print(table)
+    return int(any(finding.fatal for finding in findings))
+
+
+def _software() -> Iterator[Finding]:
+    yield Finding("forbes", f"{forbes.__version__}, Python {platform.python_version()}")
+    for name in REQUIRED:
+        yield Finding(name, version(name))
+    for name, extra in OPTIONAL.items():
+        try:
+            yield Finding(name, version(name))
+        except PackageNotFoundError:
+            yield Finding(name, "not installed (optional)", f"pip install 'forbes\\[{extra}]'")
+
+
+def _hardware() -> Iterator[Finding]:
+    threads = torch.get_num_threads()
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    yield Finding(
+        "processors", f"{cpus}, torch uses {threads} threads", "set OMP_NUM_THREADS" if threads > cpus else ""
+    )
+    if torch.cuda.is_available():
+        yield Finding("GPU", torch.cuda.get_device_name())
+    else:
+        yield Finding("GPU", "none that torch can use (optional)")
+    free = shutil.disk_usage(".").free / 2**30
+    yield Finding(
+        "free disk", f"{free:.1f} GiB here", "make room: a run takes up to 0.1 GiB" if free < 1 else "", free < 0.1
+    )
+
+
+def _data() -> Iterator[Finding]:
+    for name, path, remedy, needed in (
+        ("strokes, bundled", bundled_path(), "forbes data build-strokes --images DIR", True),
+        ("strokes, de Jong", dejong_path(), "forbes data fetch strokes (optional: the paper's set)", False),
+    ):
+        found = path.is_file()
+        yield Finding(name, str(path) if found else f"no {path}", "" if found else remedy, needed and not found)

@@ -1,0 +1,217 @@
+"""The commands `forbes fit`, `validate`, `test` and `predict`: a configuration, run by Lightning's Trainer."""
+
+import argparse
+import logging
+import signal
+import time
+import warnings
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from lightning import LightningModule, Trainer
+from lightning.fabric.plugins import CheckpointIO
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+import forbes.training.callbacks  # noqa: F401  so that configurations know them by their short names
+from forbes.data import SequenceDataModule
+from forbes.errors import ForbesError
+from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.training.config_errors import one_sentence
+from forbes.training.configuration import add_links, add_seed, allow_modules
+from forbes.training.loading import check_weights
+from forbes.training.metrics_log import JsonLinesLogger, MarkStart
+from forbes.training.progress import progress
+from forbes.training.provenance import RecordRun
+from forbes.training.run_folder import RunFolder, experiment_name
+from forbes.training.stop import StopOnSignal
+
+__all__ = ["fit", "predict", "test", "validate"]
+
+DESCRIPTION = {
+    "fit": "Train a model. It leaves a run folder with the configuration, metrics, checkpoint and figures.",
+    "validate": "Run the validation loop of a trained model.",
+    "test": "Run the test loop of a trained model; `forbes evaluate` measures it with care.",
+    "predict": "Run the prediction loop of a trained model.",
+}
+
+
+_NOT_OURS = (  # warnings that say nothing true or useful here
+    ".*does not have many workers.*",  # a batch is gathered in less time than a worker needs to hand it over
+    ".*dataloader is not resumable.*",  # it goes on from the trainer's update
+    ".*`IterableDataset` has `__len__` defined.*",  # there are no workers
+    ".*treespec, LeafSpec.*",  # Lightning 2.6 calls torch 2.13 the old way
+)
+
+
+def fit(arguments: Sequence[str]) -> int:
+    """Train a model and give the exit status."""
+    return _run("fit", arguments)
+
+
+def validate(arguments: Sequence[str]) -> int:
+    """Run the validation loop and give the exit status."""
+    return _run("validate", arguments)
+
+
+def test(arguments: Sequence[str]) -> int:
+    """Run the test loop and give the exit status."""
+    return _run("test", arguments)
+
+
+def predict(arguments: Sequence[str]) -> int:
+    """Run the prediction loop and give the exit status."""
+    return _run("predict", arguments)
+
+
+def _run(command: str, arguments: Sequence[str]) -> int:
+    """Run a command and turn what the libraries say about a wrong configuration into one sentence."""
+    for name in ("lightning.fabric", "lightning.pytorch"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    allow_modules()
+    with ExitStack() as stack, warnings.catch_warnings():
+        for message in _NOT_OURS:
+            warnings.filterwarnings("ignore", message)
+        try:
+            return _Experiment(command, arguments, stack).execute()
+        except argparse.ArgumentError as error:
+            raise ForbesError(one_sentence(str(error), arguments)) from error
+        except MisconfigurationException as error:
+            raise ForbesError(" ".join(str(error).split())) from error
+
+
+class _Experiment(LightningCLI):
+    """A command with its model, data and trainer.
+
+    Args:
+        command: fit, validate, test or predict.
+        arguments: its options.
+        stack: closed when the command ends; it holds the lock of the run folder.
+    """
+
+    def __init__(self, command: str, arguments: Sequence[str], stack: ExitStack) -> None:
+        self.command, self.arguments, self.stack = command, arguments, stack
+        options = _run_options()
+        self.options, rest = options.parse_known_args(arguments if command == "fit" else [])
+        self.resumed = RunFolder.trained(self.options.resume) if self.options.resume else None
+        if command != "fit":
+            rest = list(arguments)
+        elif self.resumed:
+            rest = ["--config", str(self.resumed.config), *rest]
+        super().__init__(
+            model_class=LightningModule,
+            datamodule_class=SequenceDataModule,
+            save_config_callback=RecordRun,
+            trainer_defaults={"devices": 1, "enable_model_summary": False},
+            parser_kwargs={
+                "prog": f"forbes {self.command}",
+                "description": DESCRIPTION[self.command],
+                "epilog": options.format_help() if self.command == "fit" else None,
+                "exit_on_error": False,
+                "allow_abbrev": False,
+            },
+            subclass_mode_model=True,
+            subclass_mode_data=True,
+            args=rest,
+            run=False,
+            auto_configure_optimizers=False,
+            load_from_checkpoint_support=False,
+        )
+
+    def add_default_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add the seed."""
+        add_seed(parser)
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add the links, and the checkpoint for the commands that need one."""
+        add_links(parser)
+        if self.command != "fit":
+            parser.add_argument("--ckpt_path", type=str, help="a trained model: runs/.../checkpoints/last.ckpt")
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Parse; Lightning's own would warn that the process has arguments, too."""
+        self.config = parser.parse_args(args)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """Build the trainer; for `fit` with a run folder and all that fills it."""
+        config = self.config_init["trainer"]
+        callbacks, plugins = _as_list(config["callbacks"]), _as_list(config["plugins"])
+        if config["enable_progress_bar"] is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
+            callbacks.append(progress())
+        if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
+            plugins.append(AtomicCheckpointIO())
+        self.stop: StopOnSignal | None = None
+        if self.command != "fit" or config["fast_dev_run"]:
+            self.save_config_callback = None
+            given = {"logger": False, "enable_checkpointing": False}
+        else:
+            given = self._run_arguments(config, callbacks)
+        return super().instantiate_trainer(**given, callbacks=callbacks, plugins=plugins, **kwargs)
+
+    def _run_arguments(self, config: Any, callbacks: list[Any]) -> dict[str, Any]:
+        """Open the run folder, add the callbacks that fill it, and give the trainer's arguments that name it."""
+        run = self._open_run()
+        print(f"run folder: {run}", flush=True)
+        self.stop = StopOnSignal(run)
+        self.save_config_kwargs = {"run": run, "stop": self.stop, "arguments": [self.command, *self.arguments]}
+        callbacks += [MarkStart(), self.stop]
+        if config["enable_checkpointing"] is not False:
+            folder, name = run.checkpoint.parent, run.checkpoint.stem
+            callbacks.append(ModelCheckpoint(folder, name, save_on_train_epoch_end=True, enable_version_counter=False))
+        loggers = config["logger"]
+        if loggers is not False:
+            loggers = [JsonLinesLogger(run.metrics), *_as_list(None if loggers is True else loggers)]
+        return {"logger": loggers, "default_root_dir": config["default_root_dir"] or run.path}
+
+    def _open_run(self) -> RunFolder:
+        """Make the run folder, or take the one that was named, and keep other processes out."""
+        options = self.options
+        if self.resumed:
+            run = self.resumed
+        elif options.run_dir:
+            run = RunFolder(options.run_dir)
+        else:
+            experiment = options.experiment or experiment_name([str(path) for path in self.config["config"] or []])
+            run = RunFolder.new(experiment, time.strftime("%Y%m%d-%H%M%S"), self.config["seed_everything"])
+        self.stack.enter_context(run.locked())
+        if not self.resumed and run.checkpoint.exists():
+            raise ForbesError(f"{run}: holds a trained run. Name another, or go on with it: forbes fit --resume {run}")
+        return run
+
+    def execute(self) -> int:
+        """Run the command and give its exit status."""
+        checkpoint = self.resumed.checkpoint if self.resumed else self.config.get("ckpt_path")
+        if checkpoint:
+            check_weights(self.model, read_checkpoint(Path(checkpoint))["state_dict"], str(checkpoint))
+        try:
+            run = getattr(self.trainer, self.command)
+            run(self.model, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
+        except SIGTERMException:
+            if self.stop is None:
+                return 128 + signal.SIGTERM
+            print(f"stopped at update {self.trainer.global_step}, go on with: forbes fit --resume {self.stop.run}")
+            return self.stop.exit_status
+        return 0
+
+
+def _as_list(value: Any) -> list[Any]:
+    """Give what a configuration holds as one thing, several, or none."""
+    return [] if value is None else list(value) if isinstance(value, list) else [value]
+
+
+def _run_options() -> argparse.ArgumentParser:
+    """Give the options of `fit` that are not part of a configuration."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False, usage=argparse.SUPPRESS)
+    group = parser.add_argument_group(
+        "run folder, runs/EXPERIMENT/TIME-SEED/ by default"
+    ).add_mutually_exclusive_group()
+    group.add_argument("--experiment", metavar="NAME", help="instead of the configuration's name")
+    group.add_argument("--run_dir", metavar="DIR", help="the folder itself")
+    group.add_argument(
+        "--resume", metavar="RUN", help="go on with this run, from its last checkpoint with its config.yaml; flags win"
+    )
+    return parser

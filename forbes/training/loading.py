@@ -1,0 +1,60 @@
+"""Load what a run has learned: the model and the data of its configuration, with the weights of its last checkpoint."""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+
+import yaml
+from torch import Tensor, nn
+
+from forbes.data import SequenceDataModule
+from forbes.errors import ForbesError
+from forbes.training.checkpoint import read_checkpoint
+from forbes.training.config_errors import one_sentence
+from forbes.training.configuration import allow_modules, experiment_parser
+from forbes.training.run_folder import RunFolder
+from forbes.training.world_model import WorldModel
+
+__all__ = ["check_weights", "load_run"]
+
+
+def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
+    """Load a run's model, on the CPU and in evaluation mode, and its data, without a Trainer.
+
+    Raises:
+        ForbesError: when the folder holds no trained run, or its configuration and its checkpoint do not fit together.
+    """
+    folder = RunFolder.trained(run)
+    state = read_checkpoint(folder.checkpoint)["state_dict"]
+    config = yaml.safe_load(folder.config.read_text())
+    allow_modules()
+    parser = experiment_parser()
+    try:
+        parsed = parser.parse_object(
+            {key: config[key] for key in ("seed_everything", "model", "data") if key in config}
+        )
+    except argparse.ArgumentError as error:
+        raise ForbesError(f"{folder.config}: {one_sentence(str(error))}") from error
+    built = parser.instantiate_classes(parsed)
+    check_weights(built.model, state, str(folder.checkpoint))
+    built.model.load_state_dict(state)
+    return built.model.eval(), built.data
+
+
+def check_weights(model: nn.Module, state: Mapping[str, Tensor], name: str) -> None:
+    """Compare the tensors of a checkpoint with those of a model.
+
+    Raises:
+        ForbesError: naming the first tensor that only one of them has, or that has two shapes.
+    """
+    own = model.state_dict()
+    for key in (*own, *state):
+        if key not in state:
+            problem = f"it has no {key}, which the configured model has: another belief family"
+        elif key not in own:
+            problem = f"its {key} is not in the configured model: another belief family"
+        elif own[key].shape != state[key].shape:
+            problem = f"its {key} is {tuple(state[key].shape)}, that of the configured model {tuple(own[key].shape)}"
+        else:
+            continue
+        raise ForbesError(f"{name}: {problem}. Use it with the configuration it was trained with")

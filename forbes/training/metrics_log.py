@@ -1,0 +1,75 @@
+"""The logger of every run: an append-only file of JSON lines that survives kills and resumes."""
+
+import json
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
+
+__all__ = ["JsonLinesLogger", "MarkStart"]
+
+
+class JsonLinesLogger(Logger):
+    """Appends {"update": n, "epoch": e, name: value, ...} for each set of metrics; `read_metrics` reads them.
+
+    `update` counts the optimiser's updates before the values were measured. A line is on its way to the disk when
+    `log_metrics` returns, so a killed process loses none that belongs to its checkpoint.
+
+    Args:
+        path: of the file, `metrics.jsonl` in a run folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+        self._whole = False
+
+    @property
+    def name(self) -> str:
+        """Nothing: Lightning puts checkpoints under `save_dir / name / version`."""
+        return ""
+
+    @property
+    def version(self) -> str:
+        """Nothing, likewise."""
+        return ""
+
+    @property
+    def save_dir(self) -> str:
+        """The run folder; Lightning gives it to callbacks as `trainer.log_dir`."""
+        return str(self.path.parent)
+
+    @rank_zero_only
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
+        """Append one line; Lightning's `step` is the index of the last update."""
+        self._append({"update": (-1 if step is None else step) + 1, **metrics})
+
+    @rank_zero_only
+    def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
+        """Do nothing: they are in config.yaml."""
+
+    @rank_zero_only
+    def mark_start(self, update: int) -> None:
+        """Note that a process goes on from here; lines of later updates above this one were lost with another."""
+        self._append({"update": update, "start": True})
+
+    def _append(self, record: dict[str, Any]) -> None:
+        with self.path.open("ab") as file:  # closed, hence flushed, at each line
+            if not self._whole:
+                content = self.path.read_bytes()
+                file.truncate(content.rfind(b"\n") + 1)  # a kill may have cut the last line short
+                self._whole = True
+            file.write(json.dumps(record).encode() + b"\n")
+
+
+class MarkStart(Callback):
+    """Tells every `JsonLinesLogger` at which update a training starts or goes on."""
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Mark it before the first update."""
+        for logger in trainer.loggers:
+            if isinstance(logger, JsonLinesLogger):
+                logger.mark_start(trainer.global_step)

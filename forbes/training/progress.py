@@ -1,0 +1,71 @@
+"""Progress of a training: a bar on a terminal, one plain line an epoch in a log file."""
+
+import sys
+import time
+from datetime import timedelta
+from typing import Any
+
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar, RichProgressBar
+
+__all__ = ["PlainProgress", "TerminalProgress", "progress"]
+
+
+def progress() -> ProgressBar:
+    """Choose by where the output goes."""
+    return TerminalProgress() if sys.stdout.isatty() else PlainProgress()
+
+
+class TerminalProgress(RichProgressBar):
+    """Lightning's bar, showing the ELBOs."""
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        """Give what the bar shows at its right."""
+        return {name: round(value, 1) for name, value in _elbos(trainer).items()}
+
+
+class PlainProgress(ProgressBar):
+    """Prints one line an epoch.
+
+    Updates, time, speed, ELBOs and the time left::
+
+        epoch 2/20  update 1000/10000  0:01:40  10.0 updates/s  train/elbo[bernoulli,S=1] -240.1  left 0:15:00
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._enabled = True
+
+    def disable(self) -> None:
+        """Print nothing from now on; Lightning calls it on every process but the first."""
+        self._enabled = False
+
+    def enable(self) -> None:
+        """Print again."""
+        self._enabled = True
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self._start, self._first = time.monotonic(), trainer.global_step
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Print the line; the epoch's validation is done."""
+        if not self._enabled:
+            return
+        elapsed = time.monotonic() - self._start
+        rate = (trainer.global_step - self._first) / elapsed
+        total = trainer.estimated_stepping_batches
+        fields = [
+            f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}",
+            f"update {trainer.global_step}/{total}",
+            str(timedelta(seconds=round(elapsed))),
+            f"{rate:.1f} updates/s",
+            *(f"{name} {value:.1f}" for name, value in _elbos(trainer).items()),
+            f"left {timedelta(seconds=round((total - trainer.global_step) / rate))}",
+        ]
+        print("  ".join(fields), flush=True)
+
+
+def _elbos(trainer: Trainer) -> dict[str, float]:
+    """Give the newest ELBO of each split."""
+    return {name: float(value) for name, value in trainer.callback_metrics.items() if "/elbo" in name}

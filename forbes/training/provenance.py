@@ -1,0 +1,120 @@
+"""Provenance: what was run, when, on which machine, by which versions and on what data."""
+
+import json
+import os
+import platform
+import shlex
+import subprocess
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from jsonargparse import Namespace
+from lightning import LightningModule, Trainer
+from lightning.pytorch.cli import LightningArgumentParser, SaveConfigCallback
+
+import forbes
+from forbes.errors import ForbesError
+from forbes.training.run_folder import RunFolder, replace_text
+from forbes.training.stop import StopOnSignal
+
+__all__ = ["RecordRun"]
+
+PACKAGES = ("torch", "lightning", "jsonargparse", "numpy")
+
+
+class RecordRun(SaveConfigCallback):
+    """Writes `config.yaml` and `provenance.json`, an entry for each start; completes the entry at the end.
+
+    An entry without `exit_status` belongs to a process that was killed, or still runs.
+
+    Args:
+        parser: of the command line.
+        config: the whole configuration.
+        run: where the files go.
+        stop: knows which signal has ended the training.
+        arguments: of the command line.
+    """
+
+    def __init__(
+        self,
+        parser: LightningArgumentParser,
+        config: Namespace,
+        run: RunFolder,
+        stop: StopOnSignal,
+        arguments: Sequence[str],
+    ) -> None:
+        super().__init__(parser, config, save_to_log_dir=False)
+        self.run, self.stop, self.arguments = run, stop, arguments
+        self._began = time.monotonic()
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Write both files before the training starts."""
+        replace_text(self.run.config, self.parser.dump(self.config, skip_none=False))
+        path = self.run.provenance
+        self._entries: list[dict[str, Any]] = json.loads(path.read_text()) if path.is_file() else []
+        seed = {"seed": self.config["seed_everything"]}
+        self._entries.append(_describe(self.arguments) | seed | _describe_data(trainer))
+        self._write()
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Note success."""
+        self._end(0)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Note failure, or the signal that has ended the training."""
+        if self.stop.received is not None:
+            self._end(self.stop.exit_status)
+        else:
+            self._end(2 if isinstance(exception, ForbesError) else 1)
+
+    def _end(self, exit_status: int) -> None:
+        if self.already_saved:
+            hours = round((time.monotonic() - self._began) / 3600, 4)
+            self._entries[-1] |= {"hours": hours, "exit_status": exit_status}
+            self._write()
+
+    def _write(self) -> None:
+        replace_text(self.run.provenance, json.dumps(self._entries, indent=2) + "\n")
+
+
+def _describe(arguments: Sequence[str]) -> dict[str, Any]:
+    """Give what does not depend on the configuration."""
+    return {
+        "command": shlex.join(["forbes", *arguments]),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": _commit(),
+        "versions": {"forbes": forbes.__version__, "python": platform.python_version()}
+        | {name: version(name) for name in PACKAGES},
+        "machine": {
+            "name": platform.node(),
+            "system": platform.platform(),
+            "cpus": os.cpu_count(),
+            "threads": torch.get_num_threads(),
+            "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        },
+    }
+
+
+def _describe_data(trainer: Trainer) -> dict[str, Any]:
+    """Give the hash of the data, where the source knows one."""
+    sha256 = getattr(trainer.datamodule.source, "sha256", None)  # type: ignore[attr-defined]
+    return {"data_sha256": sha256() if sha256 else None}
+
+
+def _commit() -> str | None:
+    """Give the commit of the checkout this package runs from, +dirty with changed files; None where git knows none."""
+    root = Path(forbes.__file__).parents[1]
+    if not (root / ".git").exists():
+        return None
+    git = ["git", "-C", str(root)]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        changes = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return commit.stdout.strip() + ("+dirty" if changes.stdout.strip() else "")

@@ -1,0 +1,141 @@
+"""Run folders: everything that one training leaves, in one place that no two processes share."""
+
+import fcntl
+import itertools
+import json
+import os
+import platform
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+import pandas as pd
+
+from forbes.errors import ForbesError
+
+__all__ = ["RunFolder", "experiment_name", "read_metrics", "replace_text"]
+
+
+class RunFolder:
+    """Where the files of a run are.
+
+    ``runs/<experiment>/<time>-<seed>/``::
+
+        config.yaml        the whole configuration, defaults included
+        provenance.json    what was run, when, by which versions, on what data: one entry for each start
+        metrics.jsonl      one JSON object a line: {"update": n, "epoch": e, name: value, ...}
+        checkpoints/       last.ckpt
+        figures/
+
+    Args:
+        path: the folder; it need not exist yet.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.config = self.path / "config.yaml"
+        self.provenance = self.path / "provenance.json"
+        self.metrics = self.path / "metrics.jsonl"
+        self.checkpoint = self.path / "checkpoints" / "last.ckpt"
+        self.figures = self.path / "figures"
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @classmethod
+    def new(cls, experiment: str, started: str, seed: int) -> "RunFolder":
+        """Make a folder of its own for a run of an experiment that starts now."""
+        parent = Path("runs") / experiment
+        for number in itertools.count(1):
+            path = parent / (f"{started}-{seed}" if number == 1 else f"{started}-{seed}-{number}")
+            try:
+                path.mkdir(parents=True)
+            except FileExistsError:
+                continue
+            return cls(path)
+        raise AssertionError("itertools.count ends")
+
+    @classmethod
+    def trained(cls, path: Path | str) -> "RunFolder":
+        """Open the folder of a run that has a checkpoint.
+
+        Raises:
+            ForbesError: when there is no such run, or it was stopped before its first checkpoint.
+        """
+        run = cls(path)
+        if not run.path.is_dir():
+            raise ForbesError(f"{run}: no such run folder. `forbes fit` makes one, under runs/")
+        if not run.config.is_file():
+            raise ForbesError(f"{run}: not a run folder, config.yaml is missing. Name a folder that `forbes fit` made")
+        if not run.checkpoint.is_file():
+            raise ForbesError(f"{run}: has no checkpoint yet. Train it: forbes fit --config {run.config}")
+        return run
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep every other process from training in this folder; the system frees it when the process dies."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        with (self.path / ".lock").open("a+") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                raise ForbesError(f"{self}: {file.read()} trains here. Choose another --run_dir") from error
+            _replace_content(file, f"process {os.getpid()} on {platform.node()}")
+            yield
+
+
+def experiment_name(configs: Sequence[str]) -> str:
+    """Name an experiment after its first configuration: configs/strokes/forbes.yaml is strokes/forbes."""
+    if not configs:
+        return "unnamed"
+    parts = Path(configs[0]).with_suffix("").parts
+    if "configs" in parts:
+        return "/".join(parts[len(parts) - parts[::-1].index("configs") :])
+    return parts[-1]
+
+
+def read_metrics(run: Path | str) -> pd.DataFrame:
+    """Read a run's metrics: a row for each update, a column for each name, the last value where there are several.
+
+    A run that was killed and resumed repeats the updates after its checkpoint; the lines of the first life are dropped.
+
+    Raises:
+        ForbesError: when the file is missing or a line is not what `forbes fit` writes.
+    """
+    path = RunFolder(run).metrics
+    if not path.is_file():
+        raise ForbesError(f"{path}: no such file. Name a run folder that `forbes fit` made")
+    rows: dict[int, dict[str, Any]] = {}
+    lines = path.read_text().splitlines(keepends=True)
+    for number, line in enumerate(lines, start=1):
+        if number == len(lines) and not line.endswith("\n"):
+            break  # a kill cut the last line short; or it is being written
+        try:
+            record = json.loads(line)
+            update = record.pop("update")
+        except (ValueError, KeyError, AttributeError) as error:
+            raise ForbesError(f"{path}: line {number} is not a line of metrics. Repair or delete it") from error
+        if record.pop("start", False):
+            rows = {known: row for known, row in rows.items() if known <= update}
+        else:
+            rows.setdefault(update, {}).update(record)
+    table = pd.DataFrame.from_dict(dict(sorted(rows.items())), orient="index")
+    table.index.name = "update"
+    return table
+
+
+def _replace_content(file: TextIO, content: str) -> None:
+    """Write a small file anew without a new inode, which would lose its lock."""
+    file.seek(0)
+    file.truncate()
+    file.write(content)
+    file.flush()
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a file so that a kill leaves the old content or the new, never half."""
+    temporary = path.with_name(f".{path.name}.part")
+    temporary.write_text(text)
+    temporary.replace(path)

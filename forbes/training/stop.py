@@ -1,0 +1,59 @@
+"""A clean stop: Ctrl-C and SIGTERM end a training after the update at hand, with a checkpoint to go on from."""
+
+import signal
+from types import FrameType
+
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+from forbes.training.run_folder import RunFolder
+
+__all__ = ["StopOnSignal"]
+
+
+class StopOnSignal(Callback):
+    """Stops a training at the first SIGINT or SIGTERM as soon as its state is whole; at the second at once.
+
+    Left alone, Lightning breaks off in the middle of an update at Ctrl-C, and saves nothing at either signal.
+
+    Args:
+        run: where the state is saved.
+    """
+
+    def __init__(self, run: RunFolder) -> None:
+        self.run = run
+        self.received: int | None = None
+
+    @property
+    def exit_status(self) -> int:
+        """What a shell expects of a process that a signal has ended: 130 for Ctrl-C, 143 for SIGTERM."""
+        return 128 + (self.received or 0)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take the place of Lightning's handler, which it puts back itself after the training."""
+        self._end_loop = signal.getsignal(signal.SIGTERM)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._receive)
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
+        """End the loop after this update, unless a validation follows, which must not be left half done."""
+        if not trainer.is_last_batch:
+            self._end()
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """End the loop after this epoch."""
+        self._end()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Save, when the loop has ended because of a signal."""
+        if isinstance(exception, SIGTERMException):
+            trainer.save_checkpoint(self.run.checkpoint)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None:
+            raise SystemExit(128 + number)
+        self.received = number
+
+    def _end(self) -> None:
+        if self.received is not None and callable(self._end_loop):
+            self._end_loop(signal.SIGTERM, None)
