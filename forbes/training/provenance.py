@@ -22,7 +22,7 @@ from forbes.errors import ForbesError
 from forbes.training.run_folder import RunFolder, replace_text
 from forbes.training.stop import StopOnSignal
 
-__all__ = ["RecordRun"]
+__all__ = ["RecordRun", "commit"]
 
 PACKAGES = ("torch", "lightning", "jsonargparse", "numpy")
 
@@ -87,7 +87,7 @@ def _describe(arguments: Sequence[str]) -> dict[str, Any]:
     return {
         "command": shlex.join(["forbes", *arguments]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "commit": _commit(),
+        "commit": commit(),
         "versions": {"forbes": forbes.__version__, "python": platform.python_version()}
         | {name: version(name) for name in PACKAGES},
         "machine": {
@@ -106,15 +106,15 @@ def _describe_data(trainer: Trainer) -> dict[str, Any]:
     return {"data_sha256": sha256() if sha256 else None}
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
     """Give the commit of the checkout this package runs from, +dirty with changed files; None where git knows none."""
     root = Path(forbes.__file__).parents[1]
     if not (root / ".git").exists():
         return None
     git = ["git", "-C", str(root)]
     try:
-        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
         changes = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
-    return commit.stdout.strip() + ("+dirty" if changes.stdout.strip() else "")
+    return head.stdout.strip() + ("+dirty" if changes.stdout.strip() else "")
