@@ -1,4 +1,4 @@
-"""Stateless randomness: a stream of numbers is a pure function of (seed, purpose, counter), so resuming needs no RNG state."""
+"""Stateless randomness: a stream is a pure function of (seed, purpose, counter); resuming needs no RNG state."""
 
 import hashlib
 

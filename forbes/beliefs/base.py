@@ -6,6 +6,8 @@ from typing import TypeAlias
 
 from torch import Tensor, nn
 
+from forbes.deferred import Bind
+
 __all__ = ["BeliefFamily", "BeliefHead", "Sampler"]
 
 Sampler: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -43,12 +45,15 @@ class BeliefHead(nn.Module, ABC):
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
         """Give log p(s | c) in nats, summed over the state: shapes `(*, D)` and `(*, C)` to `(*)`, which broadcast."""
 
-    def sampler(self) -> Sampler:
-        """Prepare `rsample` for a time loop: what does not depend on the context is computed once, here."""
+    def sampler(self, bind: Bind) -> Sampler:
+        """Prepare `rsample` for a time loop: what does not depend on the context is computed once, here.
+
+        A family may pass its weights through `bind` (see `forbes.deferred`); the default does not.
+        """
         return self.rsample
 
     def kl(self, context: Tensor, prior: "BeliefHead", prior_context: Tensor) -> Tensor | None:
-        r"""Give :math:`D_{KL}(p(\cdot \mid c) \,\|\, prior)` in nats, shape `(*)`, where a closed form exists, else None."""
+        """Give KL(p(· | c) ‖ prior(· | prior_context)) in nats, `(*)`, where a closed form exists, else None."""
         return None
 
 

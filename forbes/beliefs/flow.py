@@ -1,11 +1,11 @@
 """The flow belief of FORBES (Chen et al., 2022, arXiv 2205.11051, equations of §3.1)."""
 
-import torch
 from torch import Tensor
 
 from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.beliefs.flows import ConditionalFlow
-from forbes.beliefs.gaussian import GaussianBelief, standard_normal_log_prob
+from forbes.beliefs.gaussian import GaussianBelief
+from forbes.deferred import Bind
 
 __all__ = ["FlowBelief"]
 
@@ -44,13 +44,13 @@ class FlowBelief(BeliefHead):
         base, log_det = self.flow.inverse(state, context)
         return self.base.log_prob(base, context) - log_det
 
-    def sampler(self) -> Sampler:
-        """See `BeliefHead.sampler`: the LU matrices are the same at every step."""
-        prepared = self.flow.prepare()
+    def sampler(self, bind: Bind) -> Sampler:
+        """See `BeliefHead.sampler`."""
+        base, generate = self.base.sampler(bind), self.flow.generator(bind)
 
         def sample(context: Tensor) -> tuple[Tensor, Tensor]:
-            base, log_prob = self.base.rsample(context)
-            state, log_det = self.flow(base, context, prepared)
+            noise, log_prob = base(context)
+            state, log_det = generate(noise, context)
             return state, log_prob - log_det
 
         return sample

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from forbes.beliefs.base import BeliefHead
+from forbes.beliefs.base import BeliefHead, Sampler
+from forbes.deferred import Bind
 
 __all__ = ["GaussianBelief", "standard_normal_log_prob"]
 
@@ -17,7 +18,9 @@ def standard_normal_log_prob(noise: Tensor) -> Tensor:
 
 
 class GaussianBelief(BeliefHead):
-    r"""Diagonal Gaussian: :math:`p(s \mid c) = N(s; \mu(c), \mathrm{diag}\,\sigma(c)^2)`, :math:`\sigma = \mathrm{softplus}(\cdot) + \sigma_{min}`.
+    r"""Diagonal Gaussian.
+
+    .. math:: p(s \mid c) = N(s; \mu(c), \mathrm{diag}\,\sigma(c)^2), \qquad \sigma = \mathrm{softplus}(\cdot) + \sigma_{min}
 
     Args:
         state_dim: D.
@@ -32,14 +35,16 @@ class GaussianBelief(BeliefHead):
 
     def moments(self, context: Tensor) -> tuple[Tensor, Tensor]:
         """Give mean and standard deviation, each `(*, D)`."""
-        mean, raw_std = self.parameters_of(context).float().chunk(2, -1)  # 2 x (*, D)
-        return mean, softplus(raw_std) + self.min_std
+        return self._moments(self.parameters_of(context))
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """See `BeliefHead.rsample`."""
-        mean, std = self.moments(context)
-        noise = torch.randn(*sample_shape, *mean.shape, dtype=mean.dtype, device=mean.device)  # (*sample_shape, *, D)
-        return mean + std * noise, standard_normal_log_prob(noise) - std.log().sum(-1)
+        return _draw(*self.moments(context), sample_shape)
+
+    def sampler(self, bind: Bind) -> Sampler:
+        """See `BeliefHead.sampler`."""
+        parameters_of = bind(self.parameters_of.weight, self.parameters_of.bias)
+        return lambda context: _draw(*self._moments(parameters_of(context)))
 
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
         """See `BeliefHead.log_prob`."""
@@ -47,9 +52,21 @@ class GaussianBelief(BeliefHead):
         return standard_normal_log_prob((state - mean) / std) - std.log().sum(-1)
 
     def kl(self, context: Tensor, prior: BeliefHead, prior_context: Tensor) -> Tensor | None:
-        r"""Closed form between two Gaussians: :math:`\sum_d \log\frac{\sigma_p}{\sigma_q} + \frac{\sigma_q^2 + (\mu_q-\mu_p)^2}{2\sigma_p^2} - \frac12`."""
+        r"""See `BeliefHead.kl`; the closed form exists between two Gaussians.
+
+        .. math:: \sum_d \log\frac{\sigma_p}{\sigma_q} + \frac{\sigma_q^2 + (\mu_q-\mu_p)^2}{2\sigma_p^2} - \frac12
+        """
         if not isinstance(prior, GaussianBelief):
             return None
         (mean, std), (prior_mean, prior_std) = self.moments(context), prior.moments(prior_context)
         ratio, shift = std / prior_std, (mean - prior_mean) / prior_std
         return (0.5 * (ratio.square() + shift.square() - 1) - ratio.log()).sum(-1)
+
+    def _moments(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        mean, raw_std = parameters.chunk(2, -1)  # 2 x (*, D)
+        return mean, softplus(raw_std) + self.min_std
+
+
+def _draw(mean: Tensor, std: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+    noise = torch.randn(*sample_shape, *mean.shape, dtype=mean.dtype, device=mean.device)  # (*sample_shape, *, D)
+    return torch.addcmul(mean, std, noise), standard_normal_log_prob(noise) - std.log().sum(-1)

@@ -2,7 +2,6 @@
 
 from typing import Literal, NamedTuple
 
-import torch
 from torch import Tensor
 
 __all__ = ["ElboTerms", "FreeNats", "elbo_loss"]
@@ -19,7 +18,7 @@ class ElboTerms(NamedTuple):
     reconstruction: Tensor
     """log p(o_t | features), `(B, T)`."""
     kl: Tensor
-    """log q(s_t) - log p(s_t) at the posterior's own sample, `(B, T)`: the estimator that is reported for every family."""
+    """log q(s_t) - log p(s_t) at the posterior's own sample, `(B, T)`: what is reported, for every family."""
     analytic_kl: Tensor | None
     """The closed form of its expectation given (h_t, e_t), `(B, T)`, where the family has one."""
     mask: Tensor
@@ -40,7 +39,8 @@ def elbo_loss(
 ) -> Tensor:
     r"""Negative bound per step, with free nats.
 
-    .. math:: L = -\overline{\log p(o_t)} + \beta \max(\overline{KL_t},\, n), \quad\text{or}\quad \beta\,\overline{\max(KL_t, n)}
+    .. math:: L = \beta \max(\overline{KL_t},\, n) - \overline{\log p(o_t)}, \quad\text{or}\quad
+              L = \beta\,\overline{\max(KL_t, n)} - \overline{\log p(o_t)}
 
     The bar is the mean over batch and time, padding left out. The KL is the closed form where the terms have one.
     Free nats and the weight are for the loss only; a reported bound never has them.
@@ -58,6 +58,5 @@ def elbo_loss(
     if free_nats_per == "element":
         divergence = terms.mean_over_steps(kl.clamp(min=free_nats))
     else:
-        divergence = terms.mean_over_steps(kl)
-        divergence = torch.clamp(divergence, min=free_nats) if free_nats > 0 else divergence
+        divergence = terms.mean_over_steps(kl).clamp(min=free_nats) if free_nats > 0 else terms.mean_over_steps(kl)
     return kl_weight * divergence - terms.mean_over_steps(terms.reconstruction)

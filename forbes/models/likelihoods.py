@@ -28,7 +28,7 @@ class Likelihood(ABC):
 
 
 class Bernoulli(Likelihood):
-    r"""Binary pixels: :math:`\log p(x) = \sum x u - \mathrm{softplus}(u)` with the output u as logit; exact for 0/1 data."""
+    r"""Binary pixels with the output u as logit: :math:`\log p(x) = \sum x u - \mathrm{softplus}(u)`."""
 
     name = "bernoulli"
 

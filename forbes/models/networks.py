@@ -2,20 +2,42 @@
 
 import math
 from collections.abc import Callable
-from typing import TypeAlias
+from itertools import pairwise
+from typing import ClassVar, TypeAlias
 
+import torch
 from torch import Tensor, nn
 
+from forbes.deferred import Bind
 from forbes.errors import ForbesError
 
-__all__ = ["ConvDecoder", "ConvEncoder", "Decoder", "Encoder", "MLPDecoder", "MLPEncoder", "perceptron"]
+__all__ = ["ConvDecoder", "ConvEncoder", "Decoder", "Encoder", "MLPDecoder", "MLPEncoder", "bind_gru", "perceptron"]
 
 
 def perceptron(input_dim: int, width: int, layers: int) -> nn.Sequential:
     """Build `layers` linear layers of `width`, each followed by a ReLU."""
     dims = [input_dim] + [width] * layers
-    blocks = [nn.Sequential(nn.Linear(a, b), nn.ReLU()) for a, b in zip(dims[:-1], dims[1:], strict=True)]
+    blocks = [nn.Sequential(nn.Linear(a, b), nn.ReLU()) for a, b in pairwise(dims)]
     return nn.Sequential(*blocks)
+
+
+def bind_gru(cell: nn.GRUCell, bind: Bind) -> Callable[[Tensor, Tensor], Tensor]:
+    r"""Bind a GRU cell to a loop: (x, h) to the next h, `(B, H)`; the same numbers as `cell(x, h)`.
+
+    .. math:: r, z = \sigma(W_{ir} x + W_{hr} h), \sigma(W_{iz} x + W_{hz} h), \quad
+              n = \tanh(W_{in} x + r \odot W_{hn} h), \quad h' = n + z \odot (h - n)
+    """
+    of_input, of_hidden = bind(cell.weight_ih, cell.bias_ih), bind(cell.weight_hh, cell.bias_hh)
+    sizes = [2 * cell.hidden_size, cell.hidden_size]
+
+    def step(x: Tensor, hidden: Tensor) -> Tensor:
+        gates_x, new_x = of_input(x).split(sizes, -1)  # (B, 2 H), (B, H)
+        gates_h, new_h = of_hidden(hidden).split(sizes, -1)  # (B, 2 H), (B, H)
+        reset, update = (gates_x + gates_h).sigmoid().chunk(2, -1)  # 2 x (B, H)
+        new = torch.addcmul(new_x, reset, new_h).tanh()
+        return torch.lerp(new, hidden, update)
+
+    return step
 
 
 class Encoder(nn.Module):
@@ -68,29 +90,25 @@ class MLPDecoder(Decoder):
         layers: how many hidden layers.
     """
 
-    def __init__(
-        self, feature_dim: int, observation_shape: tuple[int, ...], width: int = 200, layers: int = 2
-    ) -> None:
+    def __init__(self, feature_dim: int, observation_shape: tuple[int, ...], width: int = 200, layers: int = 2) -> None:
         super().__init__()
         self.observation_shape = observation_shape
-        self.net = nn.Sequential(
-            perceptron(feature_dim, width, layers), nn.Linear(width, math.prod(observation_shape))
-        )
+        self.net = nn.Sequential(perceptron(feature_dim, width, layers), nn.Linear(width, math.prod(observation_shape)))
 
     def forward(self, features: Tensor) -> Tensor:
         """See `Decoder`."""
         output: Tensor = self.net(features)
-        return output.unflatten(-1, self.observation_shape)  # (N, C, H, W)
+        return output.view(-1, *self.observation_shape)  # (N, C, H, W)
 
 
 class ConvEncoder(Encoder):
-    """Dreamer's encoder: convolutions of kernel 4 and stride 2, doubling the channels, until less than 4 pixels are left.
+    """Dreamer's encoder: convolutions of kernel 4 and stride 2 until fewer than 4 pixels are left.
 
     64 pixels: 64-31-14-6-2, E = 1024 at 32 channels. 28 pixels: 28-13-5-1, E = 128.
 
     Args:
         observation_shape: (C, H, W).
-        channels: of the first layer.
+        channels: of the first layer; each further layer has twice as many.
     """
 
     def __init__(self, observation_shape: tuple[int, ...], channels: int = 32) -> None:
@@ -123,7 +141,7 @@ class ConvDecoder(Decoder):
         ForbesError: for another size.
     """
 
-    kernels = {64: (5, 5, 6, 6), 28: (5, 5, 4)}
+    kernels: ClassVar = {64: (5, 5, 6, 6), 28: (5, 5, 4)}
 
     def __init__(self, feature_dim: int, observation_shape: tuple[int, ...], channels: int = 32) -> None:
         super().__init__()

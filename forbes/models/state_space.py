@@ -16,9 +16,10 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from forbes.beliefs import BeliefFamily, BeliefHead
+from forbes.deferred import Affine, Bind, bind_now, deferred
 from forbes.models.elbo import ElboTerms
 from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import Decoder, Encoder, perceptron
+from forbes.models.networks import Decoder, Encoder, bind_gru, perceptron
 
 __all__ = ["Filtered", "Rollout", "State", "StateSpaceModel"]
 
@@ -115,7 +116,7 @@ class StateSpaceModel(nn.Module):
     def embed(self, observation: Tensor) -> Tensor:
         """Encode every frame: stored observations `(B, T, C, H, W)` to e `(B, T, E)`."""
         embedding: Tensor = self.encoder(self.likelihood.target(observation).flatten(0, 1))  # (B T, E)
-        return embedding.unflatten(0, observation.shape[:2])  # (B, T, E)
+        return embedding.view(*observation.shape[:2], -1)  # (B, T, E)
 
     def filter(self, embedding: Tensor, action: Tensor, start: State | None = None) -> Filtered:
         """Run the posterior along a sequence.
@@ -129,19 +130,18 @@ class StateSpaceModel(nn.Module):
             One trajectory of (h_t, s_t) per sequence. A prefix of the input gives the prefix of the output (for
             the same noise): nothing looks ahead.
         """
-        hidden, state = start or self.initial(len(embedding))
-        of_state, of_action = self._split(self.transition, self.state_dim)
-        of_hidden, of_embedding = self._split(self.posterior_context, self.hidden_dim)
-        # What does not depend on the recurrence is one matmul over all steps, before the loop.
-        action_shares = linear(action, of_action, self.transition[0][0].bias).unbind(1)  # T x (B, M)
-        embedding_shares = linear(embedding, of_embedding, self.posterior_context[0][0].bias).unbind(1)  # T x (B, M)
-        sample = self.posterior.sampler()
+        batch, time = embedding.shape[:2]
+        hidden, state = start or self.initial(batch)
+        bind = deferred(time, batch)
+        transition = self._bind(self.transition, action, bind)
+        posterior_context = self._bind(self.posterior_context, embedding, bind)
+        gru = bind_gru(self.gru, bind)
+        sample = self.posterior.sampler(bind)
 
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-        for action_share, embedding_share in zip(action_shares, embedding_shares, strict=True):
-            inputs = self.transition[1:](torch.addmm(action_share, state, of_state.T).relu())
-            hidden = self.gru(inputs, hidden)
-            context = self.posterior_context[1:](torch.addmm(embedding_share, hidden, of_hidden.T).relu())
+        for _ in range(time):
+            hidden = gru(transition(state), hidden)
+            context = posterior_context(hidden)
             state, log_prob = sample(context)
             steps.append((hidden, state, context, log_prob))
         return Filtered(*(torch.stack(values, 1) for values in zip(*steps, strict=True)))  # (B, T, ...)
@@ -161,7 +161,7 @@ class StateSpaceModel(nn.Module):
             T steps after `start`, which itself is not among them.
         """
         hidden, state = start
-        sample = self.prior.sampler()
+        sample = self.prior.sampler(bind_now)
         steps: list[tuple[Tensor, Tensor, Tensor]] = []
         for step_action in action.unbind(1):
             hidden = self.gru(self.transition(torch.cat((state, step_action), -1)), hidden)
@@ -178,7 +178,7 @@ class StateSpaceModel(nn.Module):
     def decode(self, features: Tensor) -> Tensor:
         """Give the likelihood's parameters: features `(*, H + D)` to `(*, C, H, W)`."""
         output: Tensor = self.decoder(features.flatten(0, -2))  # (N, C, H, W)
-        return output.unflatten(0, features.shape[:-1])  # (*, C, H, W)
+        return output.view(*features.shape[:-1], *output.shape[1:])  # (*, C, H, W)
 
     def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
         """Estimate the bound with one posterior trajectory per sequence; arguments as in `SequenceBatch`."""
@@ -195,7 +195,23 @@ class StateSpaceModel(nn.Module):
         )
 
     @staticmethod
-    def _split(network: nn.Sequential, cut: int) -> tuple[Tensor, Tensor]:
-        """Cut the first layer's weight: the share of its first `cut` inputs and that of the others."""
-        weight: Tensor = network[0][0].weight
-        return weight[:, :cut], weight[:, cut:]  # (M, cut), (M, rest)
+    def _bind(network: nn.Sequential, known: Tensor, bind: Bind) -> Affine:
+        """Bind a perceptron of [x, known] to a loop over x; the share of what is known is one matmul over all steps.
+
+        Args:
+            network: a `perceptron`.
+            known: the inputs that do not depend on the recurrence, `(B, T, K)`.
+            bind: of the loop.
+        """
+        first, *others = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+        cut = first.in_features - known.shape[-1]
+        of_loop, of_known = first.weight[:, :cut], first.weight[:, cut:]  # (M, cut), (M, K)
+        layers = [bind(of_loop, linear(known.transpose(0, 1), of_known, first.bias))]  # share (T, B, M)
+        layers += [bind(layer.weight, layer.bias) for layer in others]
+
+        def run(x: Tensor) -> Tensor:
+            for layer in layers:
+                x = layer(x).relu()
+            return x
+
+        return run
