@@ -1,0 +1,135 @@
+"""What every belief family promises: its samples have the density it gives. A new family is one line in FAMILIES."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+
+from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
+from forbes.deferred import bind_now
+
+CONTEXT = 3
+FAMILIES = {
+    "gaussian": GaussianBelief,
+    "flow": partial(FlowBelief, layers=4, width=8),
+}
+
+
+@pytest.fixture(params=FAMILIES, name="family")
+def family_fixture(request):
+    return FAMILIES[request.param]
+
+
+def random_head(family, dim=2, seed=0) -> BeliefHead:
+    """A head in float64 with no weight where it starts."""
+    torch.manual_seed(seed)
+    head = family(dim, CONTEXT).double()
+    with torch.no_grad():
+        for parameter in head.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+    return head
+
+
+def contexts(number, seed=1):
+    return torch.randn(number, CONTEXT, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def probability_on_grid(head, context, half_width=15.0, cells=600):
+    """Right edges of the cells of a square, (G,), and the probability of each cell by the midpoint rule, (G, G)."""
+    edges = torch.linspace(-half_width, half_width, cells + 1, dtype=torch.float64)
+    centres, side = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
+    with torch.no_grad():
+        density = head.log_prob(torch.cartesian_prod(centres, centres), context).exp()  # (G G,)
+    return edges[1:], (density * side**2).view(cells, cells)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_density_integrates_to_one(family, seed):
+    head = random_head(family, seed=seed)
+
+    _, probability = probability_on_grid(head, contexts(1, seed)[0])
+
+    # The midpoint rule is exact to 1e-6 for densities this smooth; the rest are tails beyond the square.
+    assert probability.sum().item() == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_samples_follow_the_density(family, seed):
+    head, context, number = random_head(family, seed=seed), contexts(1, seed)[0], 20_000
+
+    edges, probability = probability_on_grid(head, context)
+    samples = head.rsample(context, (number,))[0].detach()  # (number, 2)
+
+    # Kolmogorov-Smirnov in each marginal: the distance exceeds sqrt(-log(a / 2) / 2 n) with probability a = 1e-4.
+    limit = math.sqrt(-math.log(1e-4 / 2) / (2 * number))
+    for axis in (0, 1):
+        expected = probability.sum(1 - axis).cumsum(0)
+        observed = torch.searchsorted(samples[:, axis].sort().values, edges, right=True) / number
+        assert (observed - expected).abs().max() < limit
+    # And both at once: the quadrant below the medians, a share with a standard error of at most sqrt(1 / 4 n).
+    row, column = (int(probability.sum(1 - axis).cumsum(0).sub(0.5).abs().argmin()) for axis in (0, 1))
+    observed = (samples < torch.stack((edges[row], edges[column]))).all(-1).double().mean()
+    assert abs(observed - probability[: row + 1, : column + 1].sum()) < 4 * math.sqrt(0.25 / number)
+
+
+def test_log_prob_of_a_sample_is_what_rsample_gave(family):
+    head, context = random_head(family, dim=5), contexts(7)
+
+    state, log_prob = head.rsample(context, (11,))
+
+    assert state.shape == (11, 7, 5)
+    assert log_prob.shape == (11, 7)
+    torch.testing.assert_close(head.log_prob(state, context), log_prob)
+
+
+def test_sampler_draws_what_rsample_draws(family):
+    head, context = random_head(family), contexts(7)
+
+    torch.manual_seed(0)
+    expected = head.rsample(context)
+    torch.manual_seed(0)
+    drawn = head.sampler(bind_now)(context)
+
+    torch.testing.assert_close(drawn, expected)
+
+
+def test_samples_are_reparameterised(family):
+    """d/dc E[s] by the gradient of samples equals the difference of means with common noise."""
+    head, context = random_head(family), contexts(1)[0].requires_grad_()
+
+    def mean(at):
+        torch.manual_seed(0)
+        return head.rsample(at, (100,))[0].sum(-1).mean()
+
+    assert torch.autograd.gradcheck(mean, context)
+
+
+def test_gradients_reach_every_parameter_from_samples_and_from_densities(family):
+    head, context = random_head(family, dim=4), contexts(5)
+    names = [name for name, _ in head.named_parameters()]
+
+    state, log_prob = head.rsample(context)
+    for output in (log_prob.sum() + state.square().sum(), head.log_prob(state.detach(), context).sum()):
+        gradients = torch.autograd.grad(output, list(head.parameters()), allow_unused=True)
+        idle = [name for name, grad in zip(names, gradients, strict=True) if grad is None or not grad.any()]
+        assert idle == []
+
+
+def test_each_row_is_drawn_from_its_own_context(family):
+    head, context = random_head(family), contexts(2)
+
+    state, _ = head.rsample(context, (2000,))
+    own, other = head.log_prob(state, context).mean(0), head.log_prob(state, context.flip(0)).mean(0)
+
+    assert (own > other).all()  # Gibbs' inequality
+
+
+def test_stays_finite_far_from_the_data(family):
+    head, context = random_head(family, dim=4).float(), 1e3 * contexts(5).float()
+
+    state, log_prob = head.rsample(context)
+
+    assert state.isfinite().all()
+    assert log_prob.isfinite().all()
+    assert head.log_prob(1e3 * torch.ones(5, 4), context).isfinite().all()

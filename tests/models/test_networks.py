@@ -1,0 +1,69 @@
+"""Encoders and decoders: the sizes their documentation gives, each image on its own."""
+
+import pytest
+import torch
+from torch import nn
+
+from forbes.deferred import bind_now
+from forbes.errors import ForbesError
+from forbes.models import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
+from forbes.models.networks import bind_gru, perceptron
+
+
+@pytest.mark.parametrize(("shape", "embedding_dim"), [((3, 64, 64), 1024), ((1, 28, 28), 128)])
+def test_conv_encoder_gives_dreamers_embedding(shape, embedding_dim):
+    encoder = ConvEncoder(shape)
+
+    assert encoder.embedding_dim == embedding_dim
+    assert encoder(torch.zeros(2, *shape)).shape == (2, embedding_dim)
+
+
+def test_mlp_encoder_gives_its_width():
+    encoder = MLPEncoder((1, 28, 28), width=40, layers=3)
+
+    assert encoder.embedding_dim == 40
+    assert encoder(torch.zeros(2, 1, 28, 28)).shape == (2, 40)
+
+
+@pytest.mark.parametrize("family", [ConvDecoder, MLPDecoder])
+@pytest.mark.parametrize("shape", [(3, 64, 64), (1, 28, 28)])
+def test_decoders_give_images(family, shape):
+    assert family(17, shape)(torch.zeros(2, 17)).shape == (2, *shape)
+
+
+def test_conv_decoder_names_the_sizes_it_can_make():
+    with pytest.raises(ForbesError, match="have 32 pixels, expected 28 or 64"):
+        ConvDecoder(17, (1, 32, 32))
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        ConvEncoder((1, 28, 28), channels=4),
+        MLPEncoder((1, 28, 28)),
+        nn.Sequential(nn.Flatten(), nn.LazyLinear(9), ConvDecoder(9, (1, 28, 28), channels=4)),
+        nn.Sequential(nn.Flatten(), nn.LazyLinear(9), MLPDecoder(9, (1, 28, 28))),
+    ],
+    ids=["ConvEncoder", "MLPEncoder", "ConvDecoder", "MLPDecoder"],
+)
+def test_an_image_is_treated_alone_as_in_a_batch(network):
+    images = torch.randn(3, 1, 28, 28, generator=torch.Generator().manual_seed(0))
+
+    torch.testing.assert_close(network(images[1:2]), network(images)[1:2])
+
+
+def test_perceptron_ends_with_a_relu():
+    network = perceptron(3, width=5, layers=2)
+
+    output = network(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)))
+
+    assert output.shape == (100, 5)
+    assert output.min() == 0
+
+
+def test_bound_gru_computes_what_the_cell_computes():
+    torch.manual_seed(0)
+    cell = nn.GRUCell(4, 6).double()
+    x, hidden = torch.randn(5, 4, dtype=torch.float64), torch.randn(5, 6, dtype=torch.float64)
+
+    torch.testing.assert_close(bind_gru(cell, bind_now)(x, hidden), cell(x, hidden))
