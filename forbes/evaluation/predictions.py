@@ -1,0 +1,68 @@
+"""Predictions: what a model that saw the beginning of a sequence expects of its rest."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
+from forbes.models import StateSpaceModel
+
+__all__ = ["Completions", "complete", "first_of_each_class", "whole_sequences"]
+
+
+class Completions(NamedTuple):
+    """Sampled futures of some sequences after their first `context` steps."""
+
+    frames: Tensor
+    """E[o_t | features] in [0, 1] of steps context + 1 … T, `(N, B, T - context, C, H, W)`."""
+    context: int
+    """Steps that the model saw."""
+
+    def at(self, time: int) -> Tensor:
+        """Give the frames of step `time`, counted from 1 as in the paper, `(N, B, C, H, W)`."""
+        return self.frames[:, :, time - self.context - 1]
+
+
+@torch.no_grad()
+def complete(model: StateSpaceModel, batch: SequenceBatch, context: int, samples: int) -> Completions:
+    """Filter the first `context` steps, draw N states of the belief, roll each on to the batch's last step.
+
+    Each sample keeps its own trajectory, so what it has decided stays decided.
+
+    Args:
+        model: on the batch's device.
+        batch: B sequences of T steps, T above `context`.
+        context: steps that the model sees.
+        samples: N.
+    """
+    sequences = len(batch.observation)
+    embedding = model.embed(batch.observation[:, :context])  # (B, context, E)
+    start = model.beliefs(model.filter(embedding, batch.action[:, :context]), context - 1, samples)  # (N B, ...)
+    action = batch.action[:, context:].repeat(samples, 1, 1)  # (N B, T - context, A)
+    output = model.decode(model.imagine(start, action).features)  # (N B, T - context, C, H, W)
+    return Completions(model.likelihood.mean(output).unflatten(0, (samples, sequences)), context)
+
+
+def whole_sequences(data: SequenceDataModule, split: Split, index: Tensor) -> SequenceBatch:
+    """Give sequences up to the end of the longest, but no shorter than the module's own length."""
+    length = data.length
+    while (batch := data.sequences(split, index, length)).mask[:, -1].any():
+        length *= 2
+    last = max(data.length, int(batch.mask.sum(1).max()))
+    return SequenceBatch(*(values[:, :last] for values in batch))  # (B, last, ...)
+
+
+def first_of_each_class(data: SequenceDataModule, split: Split, count: int) -> Tensor:
+    """Choose sequences that no model has a say in: the first of each class, then the second, …; `(count,)`, int64.
+
+    A source without classes gives its first ones.
+    """
+    size = data.source.size(split)
+    if not isinstance(data.source, Strokes):
+        return torch.arange(min(count, size))
+    labels = data.source.labels(split)
+    turn = torch.empty_like(labels)  # how many of its class came before
+    for label in labels.unique():
+        turn[labels == label] = torch.arange(int((labels == label).sum()))
+    return torch.argsort(turn * (labels.max() + 1) + labels, stable=True)[:count]

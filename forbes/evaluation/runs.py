@@ -1,0 +1,109 @@
+"""Trained runs that are looked at together: what each is, and whether their numbers may be compared."""
+
+import hashlib
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+import yaml
+
+from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
+from forbes.data import SequenceBatch, SequenceDataModule, Split
+from forbes.errors import ForbesError
+from forbes.models import StateSpaceModel
+from forbes.training.loading import load_run
+from forbes.training.run_folder import RunFolder
+
+__all__ = ["TrainedRun", "data_name", "data_sha256", "load_runs", "require_comparable", "split_batches"]
+
+_FAMILIES: dict[type[BeliefHead], str] = {GaussianBelief: "RSSM", FlowBelief: "FORBES"}
+
+
+class TrainedRun(NamedTuple):
+    """A run folder with what it has learned."""
+
+    path: str
+    """As the user gave it."""
+    model: StateSpaceModel
+    data: SequenceDataModule
+    config: dict[str, Any]
+    """Sections `model` and `data` of config.yaml without the seeds: runs that differ in the seed only have the same."""
+
+    @property
+    def family(self) -> str:
+        """The model's name: RSSM or FORBES, with what its experiment's name adds, e.g. RSSM wide for `rssm_wide`."""
+        name = _FAMILIES.get(type(self.model.prior), type(self.model.prior).__name__)
+        for part in reversed(Path(self.path).resolve().parts):
+            if match := re.fullmatch(f"{name}((?:_[a-z]+)+)", part, re.IGNORECASE):
+                return name + match[1].replace("_", " ")
+        return name
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers were learned."""
+        return sum(parameter.numel() for parameter in self.model.parameters())
+
+
+def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
+    """Load runs, their models on a device."""
+    runs = []
+    for path in paths:
+        module, data = load_run(path)
+        config = yaml.safe_load(RunFolder(path).config.read_text())
+        sections = {key: _without_seed(config[key]) for key in ("model", "data")}
+        runs.append(TrainedRun(path, module.model.to(device), data, sections))
+    return runs
+
+
+def _without_seed(section: dict[str, Any]) -> dict[str, Any]:
+    arguments = {key: value for key, value in section.get("init_args", {}).items() if key != "seed"}
+    return section | {"init_args": arguments}
+
+
+def split_batches(
+    data: SequenceDataModule, split: Split, sequences: int, batch_size: int
+) -> Iterator[tuple[int, SequenceBatch]]:
+    """Give the first so many sequences of a split in order, with the index of each batch's first."""
+    for index in torch.arange(sequences).split(batch_size):
+        yield int(index[0]), data.sequences(split, index)
+
+
+def data_name(data: SequenceDataModule) -> str:
+    """Say what data these are: the source with its arguments, and the length."""
+    arguments = {
+        key: value for key, value in vars(data.source).items() if not key.startswith("_") and value is not None
+    }
+    listed = ", ".join(f"{key}={value}" for key, value in arguments.items())
+    return f"{type(data.source).__name__}({listed}), {data.length} steps"
+
+
+def data_sha256(data: SequenceDataModule, split: Split, sequences: int) -> str:
+    """Hash the content of the first so many sequences of a split, as the model sees it."""
+    digest = hashlib.sha256()
+    for _, batch in split_batches(data, split, sequences, batch_size=500):
+        for values in (batch.observation, batch.action, batch.mask):
+            digest.update(str(tuple(values.shape[1:])).encode())
+            digest.update(values.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def require_comparable(runs: Sequence[TrainedRun], hashes: Sequence[str]) -> None:
+    """Refuse runs whose data, by their hash, or whose likelihoods differ: their numbers are about different things.
+
+    Raises:
+        ForbesError: naming the first two that differ.
+    """
+    first, first_hash = runs[0], hashes[0]
+    for run, sha256 in zip(runs[1:], hashes[1:], strict=True):
+        if sha256 != first_hash:
+            raise ForbesError(
+                f"{run.path}: its data are {data_name(run.data)}, those of {first.path} are {data_name(first.data)}, "
+                "expected the same sequences. Compare runs of the same data"
+            )
+        if (name := run.model.likelihood.name) != (other := first.model.likelihood.name):
+            raise ForbesError(
+                f"{run.path}: its likelihood is {name}, that of {first.path} is {other}, expected the same. "
+                "Compare runs of the same likelihood"
+            )

@@ -1,0 +1,115 @@
+"""`forbes figures`: the paper's figures from run folders."""
+
+from collections.abc import Sequence
+from itertools import cycle
+from pathlib import Path
+
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+
+from forbes.arguments import ArgumentParser, positive
+from forbes.data import Strokes
+from forbes.errors import ForbesError
+from forbes.evaluation.predictions import whole_sequences
+from forbes.evaluation.record import read_record
+from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable
+from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
+from forbes.figures.style import BLACK, BLUE, GREEN, ORANGE, save_figure
+from forbes.training.run_folder import read_metrics
+
+__all__ = ["main"]
+
+_DESCRIPTION = """\
+Draw the paper's figures from run folders, each as PNG and PDF.
+
+  forbes figures strokes --runs runs/compare/forbes runs/compare/rssm -o figures
+
+strokes: predictions-t30 (Figure 4), the same rolled on to the end of the longest digit, and elbo (Figure 5). Runs that
+differ in their seed only are one family: Figure 4 shows the first of them, Figure 5 their mean and range.
+Digits of Figure 4, unless --index names others: of the first 500 test digits, for each class the one whose beginning
+leaves its class most open, judged by the labels of its 50 nearest training digits. No model has a say in the choice."""
+
+_FORMATS = (".png", ".pdf")
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the command with its arguments."""
+    args = _parser().parse_args(argv)
+    runs = load_runs(args.runs)
+    for run in runs:
+        if not isinstance(run.data.source, Strokes):
+            raise ForbesError(f"{run.path}: its data are {data_name(run.data)}, expected Strokes. Name other runs")
+    data = runs[0].data
+    require_comparable(runs, [data_sha256(run.data, "test", min(500, run.data.source.size("test"))) for run in runs])
+    if not args.context < data.length:
+        raise ForbesError(f"--context {args.context}: expected less than the length of the sequences, {data.length}")
+    families = group(runs)
+
+    index = _index(args.index, data.source.size("test")) if args.index else ambiguous_digits(data, args.context)
+    batch = whole_sequences(data, "test", index)
+    for time in sorted({data.length, batch.observation.shape[1]}):
+        figure = predictions(families, batch, time, args.context, args.samples)
+        _save(figure, args.output, f"predictions-t{time}")
+    metric = f"elbo[{runs[0].model.likelihood.name},S=1]"
+    _save(elbo_against_updates(families, metric.replace("elbo", "ELBO")), args.output, "elbo")
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser("forbes figures", _DESCRIPTION)
+    parser.add_argument("experiment", choices=["strokes"], help="whose figures")
+    parser.add_argument(
+        "--runs", nargs="+", required=True, metavar="RUN", help="run folders that `forbes fit` has made"
+    )
+    parser.add_argument("-o", "--output", type=Path, default=Path("figures"), help="folder (default: figures)")
+    parser.add_argument("--index", type=int, nargs="+", help="test digits of Figure 4")
+    parser.add_argument("--samples", type=positive, default=6, help="completions of each digit (default: 6)")
+    parser.add_argument("--context", type=positive, default=15, help="frames that the models see (default: 15)")
+    return parser
+
+
+def group(runs: Sequence[TrainedRun]) -> list[Family]:
+    """Make a family of runs whose configurations differ in the seed only."""
+    members: list[list[TrainedRun]] = []
+    for run in runs:
+        same = next((others for others in members if others[0].config == run.config), None)
+        if same is None:
+            members.append([run])
+        else:
+            same.append(run)
+    names = [runs_of_one[0].family for runs_of_one in members]
+    families = []
+    for runs_of_one, name, colour in zip(members, names, cycle([BLUE, ORANGE, GREEN, BLACK]), strict=False):
+        first = runs_of_one[0]
+        title = name if names.count(name) == 1 else f"{name} ({first.path})"
+        tests = [value for run in runs_of_one if (value := _test_elbo(run)) is not None]
+        families.append(Family(title, colour, first.model, [_curve(run) for run in runs_of_one], tests))
+    return families
+
+
+def _curve(run: TrainedRun) -> pd.Series:
+    """Give the validation ELBO against updates."""
+    metrics = read_metrics(run.path)
+    name = f"val/elbo[{run.model.likelihood.name},S=1]"
+    if name not in metrics:
+        raise ForbesError(f"{run.path}: metrics.jsonl has no {name}. Train the run to its first validation")
+    return metrics[name].dropna()
+
+
+def _test_elbo(run: TrainedRun) -> float | None:
+    """Give what `forbes evaluate` found on the whole test split, if it was asked."""
+    metrics = read_record(run.path).get("test", {}).get("metrics", {})
+    return next((metric["mean"] for name, metric in metrics.items() if name.startswith("test/elbo[")), None)
+
+
+def _index(index: Sequence[int], size: int) -> torch.Tensor:
+    for value in index:
+        if not 0 <= value < size:
+            raise ForbesError(f"--index {value}: the test split has {size} digits, expected 0 to {size - 1}")
+    return torch.tensor(index)
+
+
+def _save(figure: Figure, folder: Path, name: str) -> None:
+    for suffix in _FORMATS:
+        save_figure(figure, folder / f"{name}{suffix}")
+        print(folder / f"{name}{suffix}")

@@ -1,0 +1,91 @@
+"""Grids of frames: truth, what a model saw, and what it expects, side by side (paper, Figure 4)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from forbes.figures.style import BLACK, GREY, PAGE, paper_style
+
+__all__ = ["Panel", "draw_panels", "seen_panel", "truth_panel"]
+
+_GAP = 2  # pixels between the frames of a panel
+_GAP_COLOUR = 0.86
+
+
+class Panel(NamedTuple):
+    """Frames side by side under one title."""
+
+    title: str
+    images: Tensor
+    """Grey values or colours in [0, 1], rows × columns: `(R, K, C, H, W)`, C 1 or 3."""
+    colour: str
+    """Of the ink, where the frames are grey."""
+    labels: Sequence[str] = ()
+    """One for each column, below it."""
+
+
+def truth_panel(observation: Tensor, times: Sequence[int]) -> Panel:
+    """Show sequences `(B, T, C, H, W)` at some steps, counted from 1."""
+    return Panel("truth", _frames(observation, times), BLACK, [f"t={time}" for time in times])
+
+
+def seen_panel(observation: Tensor, context: int) -> Panel:
+    """Show three of the frames that a model sees."""
+    times = sorted({-(-context * part // 3) for part in (1, 2, 3)})
+    return Panel("seen", _frames(observation, times), GREY, [f"t={time}" for time in times])
+
+
+def _frames(observation: Tensor, times: Sequence[int]) -> Tensor:
+    """Pick steps, counted from 1, and scale what is stored to [0, 1]: `(B, T, C, H, W)` to `(B, K, C, H, W)`."""
+    grey = observation.float() / observation.max().clamp(min=1)
+    return grey[:, [time - 1 for time in times]]
+
+
+def draw_panels(panels: Sequence[Panel], width: float = PAGE) -> Figure:
+    """Draw panels of equal rows beside each other, all frames of the same size."""
+    rows, height, wide = (panels[0].images.shape[d] for d in (0, 3, 4))
+    margin, title, labels = 0.03, 0.24, 0.18  # inches: left and right, above, below
+    space = 0.7  # between panels, in frames
+    columns = [panel.images.shape[1] for panel in panels]
+    cell = (width - 2 * margin) / (sum(columns) + space * (len(panels) - 1))  # inches
+    tall = rows * cell * height / wide
+    total = title + tall + labels
+    with paper_style():
+        figure = Figure((width, total))
+        left = margin
+        for panel, count in zip(panels, columns, strict=True):
+            axes = figure.add_axes((left / width, labels / total, count * cell / width, tall / total))
+            _draw_panel(axes, panel)
+            left += (count + space) * cell
+    return figure
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    width = panel.images.shape[-1] + _GAP
+    axes.imshow(_mosaic(panel.images, panel.colour), aspect="auto")
+    axes.set_title(panel.title, color=panel.colour, pad=4)
+    axes.set_xticks([width * k + width / 2 for k in range(len(panel.labels))], panel.labels, fontsize=6, color=GREY)
+    axes.tick_params(length=0, pad=2)
+    axes.set_yticks([])
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
+
+
+def _mosaic(images: Tensor, colour: str) -> NDArray[np.float32]:
+    """Paint frames in ink on white, side by side: `(R, K, C, H, W)` to `(R (H + gap) + gap, K (W + gap) + gap, 3)`."""
+    rows, columns, channels, height, width = images.shape
+    frames = images.detach().float().cpu().numpy().transpose(0, 3, 1, 4, 2)  # (R, H, K, W, C)
+    if channels == 1:
+        frames = 1 - frames * (1 - np.asarray(to_rgb(colour), dtype=np.float32))  # (R, H, K, W, 3)
+    canvas = np.full((rows * (height + _GAP) + _GAP, columns * (width + _GAP) + _GAP, 3), _GAP_COLOUR, np.float32)
+    for r in range(rows):
+        for k in range(columns):
+            y, x = r * (height + _GAP) + _GAP, k * (width + _GAP) + _GAP
+            canvas[y : y + height, x : x + width] = frames[r, :, k]
+    return canvas

@@ -1,0 +1,103 @@
+"""The paper's figures on digit strokes: predictions (Figure 4) and the ELBO against updates (Figure 5)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
+from forbes.evaluation.predictions import complete
+from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
+from forbes.figures.style import COLUMN, paper_style, show_settled
+from forbes.models import StateSpaceModel
+
+__all__ = ["Family", "ambiguous_digits", "elbo_against_updates", "predictions"]
+
+
+class Family(NamedTuple):
+    """Runs of one configuration, with different seeds."""
+
+    name: str
+    colour: str
+    model: StateSpaceModel
+    """Of the first run."""
+    curves: Sequence[pd.Series]
+    """Validation ELBO against updates, one for each run."""
+    tests: Sequence[float]
+    """Test ELBO of each run that was evaluated."""
+
+
+def predictions(
+    families: Sequence[Family], batch: SequenceBatch, time: int, context: int, samples: int, seed: int = 0
+) -> Figure:
+    """Draw Figure 4: truth, some of the frames seen, and N sampled completions of each family for the same digits.
+
+    Args:
+        families: a group of columns each.
+        batch: the digits, a row each, at least `time` steps.
+        time: the step that is shown, counted from 1.
+        context: steps that the models see.
+        samples: N.
+        seed: of the samples.
+    """
+    last = batch.observation.shape[1]
+    panels = [truth_panel(batch.observation, sorted({time, last})[::-1]), seen_panel(batch.observation, context)]
+    with torch.random.fork_rng(devices=[]):
+        for family in families:
+            torch.manual_seed(seed)
+            frames = complete(family.model, batch, context, samples).at(time)  # (N, B, C, H, W)
+            panels.append(Panel(f"{family.name}, t = {time}", frames.transpose(0, 1), family.colour))
+    return draw_panels(panels)
+
+
+def elbo_against_updates(families: Sequence[Family], metric: str) -> Figure:
+    """Draw Figure 5: validation ELBO against updates, mean and range over runs; a diamond is the final test ELBO."""
+    with paper_style():
+        figure = Figure((COLUMN, 2.3), layout="constrained")
+        axes = figure.subplots()
+        for family in families:
+            table = pd.concat(family.curves, axis=1).dropna()  # updates that all runs have
+            mean, runs = table.mean(axis=1), len(family.curves)
+            label = family.name if runs == 1 else f"{family.name}, mean and range of {runs} runs"
+            axes.fill_between(table.index, table.min(axis=1), table.max(axis=1), color=family.colour, alpha=0.2, lw=0)
+            axes.plot(table.index, mean, color=family.colour, label=label)
+            if family.tests:
+                test = sum(family.tests) / len(family.tests)
+                axes.plot(table.index.max(), test, "D", color=family.colour, markersize=4, clip_on=False, zorder=3)
+        if any(family.tests for family in families):
+            axes.plot([], [], "D", color="none", markeredgecolor="black", markersize=4, label="test, at the end")
+        show_settled(axes, [curve for family in families for curve in family.curves])
+        axes.set(xlabel="updates", ylabel=f"validation {metric}\nnats per sequence")
+        axes.legend(loc="lower right")
+    return figure
+
+
+def ambiguous_digits(data: SequenceDataModule, context: int, candidates: int = 500, neighbours: int = 50) -> Tensor:
+    """Choose test digits whose beginning leaves their class open, without asking any model.
+
+    Of the first 500 test digits, it is for each class the one whose 50 nearest training digits, by the blurred frame
+    t = `context`, disagree most about the class (the entropy of their labels); `(classes,)`, int64.
+    """
+    source = data.source
+    assert isinstance(source, Strokes)
+    train, labels = _blurred(data, "train", source.size("train"), context), source.labels("train")
+    test, own = _blurred(data, "test", min(candidates, source.size("test")), context), source.labels("test")
+    nearest = torch.cdist(test, train).topk(min(neighbours, len(train)), largest=False).indices  # (N, neighbours)
+    counts = torch.nn.functional.one_hot(labels[nearest], 10).sum(1).double()  # (N, 10)
+    entropy = torch.special.entr(counts / counts.sum(1, keepdim=True)).sum(1)  # (N,)
+    own = own[: len(test)]
+    chosen = [torch.where(own == label, entropy, -1).argsort(descending=True, stable=True)[0] for label in own.unique()]
+    return torch.stack(chosen)
+
+
+def _blurred(data: SequenceDataModule, split: Split, count: int, time: int) -> Tensor:
+    """Give step `time` of the first digits of a split, blurred so that a pen one pixel aside is near, `(N, H W)`."""
+    parts = []
+    for index in torch.arange(count).split(5000):
+        frames = data.sequences(split, index, time).observation[:, -1].float()  # (B, 1, H, W)
+        parts.append(avg_pool2d(frames, 5, stride=1, padding=2).flatten(1))  # (B, H W)
+    return torch.cat(parts)

@@ -1,0 +1,77 @@
+"""The look of every picture, set in one place: sizes for a paper of two columns, few colours, no pyplot state."""
+
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from forbes.files import replace_file
+
+__all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "density_map", "paper_style"]
+__all__ += ["save_figure", "show_settled"]
+
+COLUMN, PAGE = 3.3, 6.9
+"""Widths in inches: one column and the whole page."""
+
+BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#007a5a"
+"""They differ in hue and in brightness, for the colour-blind and for print (after Okabe and Ito)."""
+BLACK, GREY = "#1a1a1a", "#808080"
+
+_STYLE: dict[Any, Any] = {
+    "axes.grid": True,
+    "axes.labelsize": 8,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": 8,
+    "figure.dpi": 200,
+    "figure.titlesize": 8,
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same picture on every machine
+    "font.size": 8,
+    "grid.alpha": 0.3,
+    "grid.linewidth": 0.5,
+    "image.interpolation": "nearest",
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "pdf.fonttype": 42,  # fonts as TrueType: text stays text
+    "savefig.dpi": 200,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+}
+
+
+@contextmanager
+def paper_style() -> Iterator[None]:
+    """Draw in our style, and leave the caller's as it was."""
+    with mpl.rc_context(_STYLE):
+        yield
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a picture in the format of the path's suffix; a reader never sees half of it, old or new."""
+    content = io.BytesIO()
+    # Without a date, the same picture is the same bytes.
+    metadata = {"CreationDate": None} if path.suffix == ".pdf" else None
+    with paper_style():
+        figure.savefig(content, format=path.suffix[1:], metadata=metadata)
+    replace_file(path, content.getvalue())
+
+
+def density_map(colour: str) -> LinearSegmentedColormap:
+    """Give a colour map from white to a colour."""
+    return LinearSegmentedColormap.from_list("density", ["white", colour])
+
+
+def show_settled(axes: Axes, curves: Sequence[pd.Series]) -> None:
+    """Choose the height of an axis of curves over updates: their first tenth, which comes from afar, may leave it."""
+    first = 0.1 * max(curve.index.max() for curve in curves)
+    settled = [value for curve in curves for value in curve[curve.index >= first]]
+    margin = 0.05 * (max(settled) - min(settled)) + 1e-6
+    axes.set_ylim(min(settled) - margin, max(settled) + margin)

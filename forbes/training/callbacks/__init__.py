@@ -1,0 +1,9 @@
+"""Callbacks: they watch a training and draw; none of them changes it."""
+
+from forbes.training.callbacks.belief_plot import BeliefPlot
+from forbes.training.callbacks.elbo_curve import ElboCurve
+from forbes.training.callbacks.parameter_count import ParameterCount
+from forbes.training.callbacks.picture import PictureCallback
+from forbes.training.callbacks.prediction_grid import PredictionGrid
+
+__all__ = ["BeliefPlot", "ElboCurve", "ParameterCount", "PictureCallback", "PredictionGrid"]

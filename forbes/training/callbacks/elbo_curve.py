@@ -1,0 +1,76 @@
+"""The bound and its parts while the model learns."""
+
+import pandas as pd
+import torch
+from lightning import Trainer
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from forbes.data import SequenceDataModule
+from forbes.figures.style import BLACK, BLUE, GREY, PAGE, paper_style, show_settled
+from forbes.training.callbacks.picture import PictureCallback, to_device
+from forbes.training.run_folder import read_metrics
+from forbes.training.world_model import WorldModel
+
+__all__ = ["ElboCurve"]
+
+
+class ElboCurve(PictureCallback):
+    """Draws `figures/elbo.png`: ELBO, reconstruction and KL of both splits against updates, and the KL at each step.
+
+    It reads `metrics.jsonl`, so a resumed run shows its whole life.
+
+    Args:
+        sequences: of the validation split, for the KL at each step.
+        every: draw after every k-th validation.
+    """
+
+    filename = "elbo.png"
+
+    def __init__(self, sequences: int = 200, every: int = 5) -> None:
+        super().__init__(every)
+        self.sequences = sequences
+
+    def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
+        """See `PictureCallback`."""
+        metrics = read_metrics(str(trainer.log_dir))
+        likelihood = module.model.likelihood.name
+        curves = {"ELBO": f"elbo[{likelihood},S=1]", "reconstruction": "reconstruction", "KL": "kl"}
+        with paper_style():
+            figure = Figure((PAGE, 4.2), layout="constrained")
+            axes = figure.subplots(2, 2).flat
+            for panel, (title, name) in zip(axes, curves.items(), strict=False):
+                _draw_curves(panel, metrics, name)
+                panel.set(title=title, xlabel="updates", ylabel="nats per sequence")
+            _draw_steps(axes[3], *self._kl_per_step(module, data))
+            axes[0].legend()
+        return figure
+
+    def _kl_per_step(self, module: WorldModel, data: SequenceDataModule) -> tuple[Tensor, Tensor]:
+        """Average the KL over sequences, each step on its own: mean and standard error, each `(T,)`."""
+        index = torch.arange(min(self.sequences, data.source.size("validation")))
+        batches = [to_device(data.sequences("validation", part), module) for part in index.split(data.batch_size)]
+        terms = [module.terms(batch) for batch in batches]
+        kl = torch.cat([term.kl.masked_fill(~term.mask, torch.nan) for term in terms]).cpu()  # (B, T)
+        count = kl.isfinite().sum(0)
+        spread = (kl - kl.nanmean(0)).square().nansum(0).div((count - 1).clamp(min=1)).sqrt()
+        return kl.nanmean(0), spread / count.sqrt()  # (T,), (T,)
+
+
+def _draw_curves(axes: Axes, metrics: pd.DataFrame, name: str) -> None:
+    """Draw one metric of both splits."""
+    curves = []
+    for split, label, colour in [("train", "train", GREY), ("val", "validation", BLUE)]:
+        if f"{split}/{name}" in metrics:
+            curves.append(metrics[f"{split}/{name}"].dropna())
+            axes.plot(curves[-1].index, curves[-1], color=colour, label=label)
+    show_settled(axes, curves)
+
+
+def _draw_steps(axes: Axes, mean: Tensor, error: Tensor) -> None:
+    time = torch.arange(1, len(mean) + 1)
+    axes.fill_between(time, mean - error, mean + error, color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(time, mean, color=BLUE)
+    axes.set(title="KL at each step, validation", xlabel="t", ylabel="nats")
+    axes.axhline(0, color=BLACK, linewidth=0.5)
