@@ -1,0 +1,215 @@
+"""The LightningModule: what it optimises, what it logs, and that its noise depends on seed and update only."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+from lightning import LightningDataModule, Trainer
+from lightning.pytorch.callbacks import Callback
+from torch.utils.data import DataLoader
+
+from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.data import SequenceBatch
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, elbo_loss
+from forbes.training import WorldModel
+
+# Lightning 2.6 uses what torch 2.13 deprecates, and has its opinion on loaders without workers.
+pytestmark = [pytest.mark.filterwarnings(f"ignore:.*{text}") for text in ("LeafSpec", "does not have many workers")]
+
+BATCH, TIME, SHAPE = 4, 5, (1, 4, 4)
+BOUND = "elbo[bernoulli,S=1]"
+
+
+def make_world_model(**options):
+    torch.manual_seed(0)
+    defaults = {
+        "belief": partial(FlowBelief, layers=2, width=4),
+        "encoder": partial(MLPEncoder, width=8, layers=1),
+        "decoder": partial(MLPDecoder, width=8, layers=1),
+        "likelihood": Bernoulli(),
+        "observation_shape": SHAPE,
+        "action_dim": 1,
+        "state_dim": 2,
+        "hidden_dim": 6,
+        "mlp_dim": 8,
+        "mlp_layers": 1,
+        "free_nats": 0.0,
+    }
+    return WorldModel(**{**defaults, **options})
+
+
+def make_batch(seed=0, batch=BATCH):
+    generator = torch.Generator().manual_seed(seed)
+    mask = torch.ones(batch, TIME, dtype=torch.bool)
+    mask[0, 3:] = False
+    return SequenceBatch(
+        torch.randint(2, (batch, TIME, *SHAPE), generator=generator, dtype=torch.uint8),
+        torch.rand(batch, TIME, 1, generator=generator),
+        torch.zeros(batch, TIME),
+        mask,
+    )
+
+
+class Batches(LightningDataModule):
+    """The same batch again and again; two batches of different sizes for validation."""
+
+    def __init__(self, updates):
+        super().__init__()
+        self.updates = updates
+
+    def train_dataloader(self):
+        return DataLoader([make_batch()] * self.updates, batch_size=None)
+
+    def val_dataloader(self):
+        return DataLoader([make_batch(1), make_batch(2, batch=1)], batch_size=None)
+
+    test_dataloader = predict_dataloader = val_dataloader
+
+
+class Recorder(Callback):
+    """What each update logged, its loss, learning rate and norm of the gradients it used."""
+
+    def __init__(self):
+        self.rows = []
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        metrics = {name: value.item() for name, value in trainer.callback_metrics.items()}
+        norm = torch.stack([p.grad.norm() for p in pl_module.parameters() if p.grad is not None]).norm()
+        [group] = trainer.optimizers[0].param_groups
+        self.rows.append({**metrics, "loss": outputs["loss"].item(), "rate": group["lr"], "used_norm": norm.item()})
+
+
+def fit(model, updates=3):
+    recorder = Recorder()
+    trainer = Trainer(
+        accelerator="cpu",
+        max_epochs=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        log_every_n_steps=1,
+        callbacks=[recorder],
+    )
+    trainer.fit(model, Batches(updates))
+    return trainer, recorder
+
+
+def terms_of_first_update(model):
+    """The bound's parts on the batch with the weights the model starts from and the noise of update 0."""
+    model.on_train_batch_start(make_batch(), 0)
+    return model.terms(make_batch())
+
+
+@pytest.mark.parametrize(
+    ("options", "loss"),
+    [
+        ({}, elbo_loss),
+        ({"free_nats": 9.0}, lambda terms: elbo_loss(terms, 9.0)),
+        ({"free_nats": 0.5, "free_nats_per": "element"}, lambda terms: elbo_loss(terms, 0.5, "element")),
+        ({"belief": GaussianBelief}, elbo_loss),
+        ({"belief": GaussianBelief, "kl": "monte_carlo"}, lambda terms: elbo_loss(terms._replace(analytic_kl=None))),
+        ({"kl_warmup": 10}, lambda terms: elbo_loss(terms, kl_weight=0.1)),
+    ],
+    ids=["plain", "free nats", "free nats per element", "closed form", "monte carlo", "warm-up"],
+)
+def test_the_loss_is_the_bound_with_the_options_asked_for(options, loss):
+    _, recorder = fit(make_world_model(**options), updates=1)
+
+    expected = loss(terms_of_first_update(make_world_model(**options)))
+
+    assert recorder.rows[0]["loss"] == pytest.approx(expected.item())
+
+
+def test_the_logged_bound_knows_no_free_nats_weights_or_closed_forms():
+    options = {"belief": GaussianBelief, "free_nats": 9.0, "kl_warmup": 10}
+    _, recorder = fit(make_world_model(**options), updates=1)
+
+    terms = terms_of_first_update(make_world_model(**options))
+
+    logged = recorder.rows[0]
+    assert logged[f"train/{BOUND}"] == pytest.approx(terms.elbo.mean().item())
+    assert logged["train/kl"] == pytest.approx((terms.kl * terms.mask).sum().item() / BATCH)
+    assert logged["train/reconstruction"] - logged["train/kl"] == pytest.approx(logged[f"train/{BOUND}"])
+
+
+def test_the_weight_of_the_divergence_rises_to_one():
+    """With the learning rate at 0 the loss changes by the weight and the noise only; free nats fix the divergence."""
+    _, recorder = fit(make_world_model(learning_rate=0.0, kl_warmup=4, free_nats=50.0), updates=6)
+    _, without = fit(make_world_model(learning_rate=0.0, free_nats=50.0), updates=6)
+
+    missing = [full["loss"] - row["loss"] for full, row in zip(without.rows, recorder.rows, strict=True)]
+
+    assert missing == pytest.approx([37.5, 25, 12.5, 0, 0, 0], abs=1e-4)
+
+
+def test_noise_depends_on_seed_and_update_only():
+    def losses(model):
+        return [row["loss"] for row in fit(model)[1].rows]
+
+    first = losses(make_world_model(learning_rate=0.0))
+    torch.manual_seed(123)
+
+    assert losses(make_world_model(learning_rate=0.0)) == first
+    assert losses(make_world_model(learning_rate=0.0, seed=1)) != first
+    assert len(set(first)) == 3
+
+
+def test_validation_has_the_same_noise_each_time_and_weighs_sequences_equally():
+    trainer, _ = fit(make_world_model(learning_rate=0.0), updates=1)
+    name, model = f"val/{BOUND}", trainer.lightning_module
+    in_training = trainer.callback_metrics[name].item()
+
+    [again] = trainer.validate(model, Batches(1), verbose=False)
+    torch.manual_seed(5)
+    model.on_validation_epoch_start()
+    with torch.no_grad():
+        each = torch.cat([model.terms(batch).elbo for batch in (make_batch(1), make_batch(2, batch=1))])
+
+    assert again[name] == in_training
+    assert in_training == pytest.approx(each.mean().item())  # of five sequences, not of two batches
+
+
+def test_test_and_prediction_give_the_bound_of_each_sequence():
+    trainer, _ = fit(make_world_model(), updates=1)
+
+    [logged] = trainer.test(trainer.lightning_module, Batches(1), verbose=False)
+    predicted = trainer.predict(trainer.lightning_module, Batches(1))
+
+    assert set(logged) == {f"test/{BOUND}", "test/reconstruction", "test/kl"}
+    assert [elbo.shape for elbo in predicted] == [(BATCH,), (1,)]
+
+
+def test_gradients_are_scaled_to_the_clip_norm_and_the_norm_before_is_logged():
+    free, clipped = (fit(make_world_model(clip_norm=norm), updates=1)[1].rows[0] for norm in (1e6, 0.1))
+
+    assert free["used_norm"] > 0.1
+    assert clipped["used_norm"] == pytest.approx(0.1, rel=1e-4)
+    assert clipped["train/gradient_norm"] == pytest.approx(free["used_norm"], rel=1e-5)
+
+
+def test_adam_has_the_papers_settings_and_every_parameter():
+    trainer, _ = fit(make_world_model(), updates=1)
+    [optimizer], model = trainer.optimizers, trainer.lightning_module
+    [group] = optimizer.param_groups
+
+    assert (group["lr"], group["eps"], group["betas"], group["weight_decay"]) == (5e-4, 1e-7, (0.9, 0.999), 0)
+    assert {id(p) for p in group["params"]} == {id(p) for p in model.parameters()}
+
+
+def test_the_cosine_schedule_ends_at_zero_after_the_last_update():
+    _, recorder = fit(make_world_model(schedule="cosine", learning_rate=1.0), updates=4)
+
+    after_update = [0.5 * (1 + math.cos(math.pi * update / 4)) for update in (1, 2, 3, 4)]
+
+    assert [row["rate"] for row in recorder.rows] == pytest.approx(after_update)
+
+
+def test_an_update_changes_every_parameter_sooner_or_later():
+    model = make_world_model()
+    before = {name: p.detach().clone() for name, p in model.named_parameters()}
+
+    fit(model, updates=3)
+
+    assert [name for name, p in model.named_parameters() if torch.equal(p, before[name])] == []
