@@ -1,0 +1,51 @@
+"""The training loss is one graph: nothing in it makes torch.compile fall back to Python."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, StateSpaceModel, elbo_loss
+
+SHAPE = (1, 4, 4)
+
+
+@pytest.fixture(params=[GaussianBelief, partial(FlowBelief, layers=2, width=4)], ids=["gaussian", "flow"], name="model")
+def model_fixture(request):
+    torch.manual_seed(0)
+    encoder, decoder = MLPEncoder(SHAPE, 8, 1), MLPDecoder(6 + 2, SHAPE, 8, 1)
+    return StateSpaceModel(
+        request.param, encoder, decoder, Bernoulli(), action_dim=1, state_dim=2, hidden_dim=6, mlp_dim=8, mlp_layers=1
+    )
+
+
+@pytest.fixture(autouse=True)
+def fresh_compiler():
+    torch.compiler.reset()
+    yield
+    torch.compiler.reset()
+
+
+def inputs(steps=2):
+    observation = torch.randint(2, (3, steps, *SHAPE), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    return observation, torch.zeros(3, steps, 1), torch.ones(3, steps, dtype=torch.bool)
+
+
+def test_the_loss_has_no_graph_break(model):
+    explanation = torch._dynamo.explain(lambda *batch: elbo_loss(model.elbo(*batch), free_nats=3.0))(*inputs())
+
+    assert explanation.graph_break_count == 0, explanation.break_reasons
+    assert explanation.graph_count == 1
+
+
+def test_the_compiled_loss_has_the_same_value_and_gradients(model):
+    compiled = torch.compile(lambda *batch: elbo_loss(model.elbo(*batch)), fullgraph=True, backend="aot_eager")
+    results = []
+
+    for loss_of in (lambda *batch: elbo_loss(model.elbo(*batch)), compiled):
+        torch.manual_seed(0)
+        loss = loss_of(*inputs())
+        results.append((loss, *torch.autograd.grad(loss, list(model.parameters()))))
+
+    torch.testing.assert_close(results[0], results[1])
