@@ -18,7 +18,7 @@ from forbes.arguments import ArgumentParser, positive
 from forbes.data import SequenceBatch, Split
 from forbes.errors import ForbesError
 from forbes.evaluation.elbo import Bound, Estimate, evaluate_elbo, paired_difference
-from forbes.evaluation.record import bound_metrics, summary, write_record
+from forbes.evaluation.record import bound_metrics, read_record, summary, write_record
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, split_batches
 from forbes.training.provenance import commit
 
@@ -54,6 +54,8 @@ def main(argv: Sequence[str]) -> None:
     counts = [_count(run, args.split, args.digits) for run in runs]
     hashes = [data_sha256(run.data, args.split, count) for run, count in zip(runs, counts, strict=True)]
     require_comparable(runs, hashes)
+    for run in runs:
+        read_record(run.path)  # a broken one is said before minutes are spent
     evaluations = []
     for run in runs:
         evaluation = _evaluate(run, args, counts[0])

@@ -93,7 +93,7 @@ def _draw_beliefs(above: Axes, below: Axes, prior: _Cloud, posterior: _Cloud, na
         prior, posterior, plane = _principal_plane(prior.samples, posterior.samples)
         kind = "KDE"
     _draw_cloud(above, prior, ORANGE, torch.cat((prior.samples, posterior.samples)))
-    above.plot(*posterior.samples[:_DOTS].T, ".", color=BLUE, markersize=1, alpha=0.6)
+    above.plot(*posterior.samples[:_DOTS].numpy().T, ".", color=BLUE, markersize=1, alpha=0.6)
     _draw_cloud(below, posterior, BLUE, posterior.samples)
     below.set_xlabel(plane, fontsize=6)
     if named:
@@ -106,12 +106,12 @@ def _draw_cloud(axes: Axes, cloud: _Cloud, colour: str, shown: Tensor) -> None:
     low, high = shown.quantile(0.002, 0), shown.quantile(0.998, 0)  # (2,), (2,)
     margin = 0.15 * (high - low) + 1e-6
     (left, bottom), (right, top) = (low - margin).tolist(), (high + margin).tolist()
-    density = cloud.density(torch.linspace(left, right, _GRID), torch.linspace(bottom, top, _GRID))  # (Y, X)
+    density = cloud.density(torch.linspace(left, right, _GRID), torch.linspace(bottom, top, _GRID)).numpy()  # (Y, X)
     extent = (left, right, bottom, top)
     axes.imshow(
         density, extent=extent, origin="lower", aspect="auto", cmap=density_map(colour), interpolation="bilinear"
     )
-    axes.plot(*cloud.samples[:_DOTS].T, ".", color=BLACK, markersize=1, alpha=0.35)
+    axes.plot(*cloud.samples[:_DOTS].numpy().T, ".", color=BLACK, markersize=1, alpha=0.35)
     axes.set(xlim=(left, right), ylim=(bottom, top))
     axes.locator_params(nbins=3)
     axes.tick_params(labelsize=5, length=2, pad=1)
@@ -119,7 +119,7 @@ def _draw_cloud(axes: Axes, cloud: _Cloud, colour: str, shown: Tensor) -> None:
 
 
 def _draw_frame(axes: Axes, observation: Tensor, title: str) -> None:
-    axes.imshow(observation.float().mean(0).cpu(), cmap="gray_r", vmin=0)
+    axes.imshow(observation.float().mean(0).cpu().numpy(), cmap="gray_r", vmin=0)
     axes.set_title(title, pad=2)
     axes.set_axis_off()
 

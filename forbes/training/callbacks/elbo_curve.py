@@ -69,8 +69,8 @@ def _draw_curves(axes: Axes, metrics: pd.DataFrame, name: str) -> None:
 
 
 def _draw_steps(axes: Axes, mean: Tensor, error: Tensor) -> None:
-    time = torch.arange(1, len(mean) + 1)
-    axes.fill_between(time, mean - error, mean + error, color=BLUE, alpha=0.25, linewidth=0)
-    axes.plot(time, mean, color=BLUE)
-    axes.set(title="KL at each step, validation", xlabel="t", ylabel="nats")
+    time = range(1, len(mean) + 1)
+    axes.fill_between(time, (mean - error).numpy(), (mean + error).numpy(), color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(time, mean.numpy(), color=BLUE)
     axes.axhline(0, color=BLACK, linewidth=0.5)
+    axes.set(title="KL at each step, validation", xlabel="t", ylabel="nats")

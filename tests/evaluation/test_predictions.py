@@ -1,0 +1,101 @@
+"""Completions start from the belief after the prefix, and each goes its own way."""
+
+import pytest
+import torch
+
+from forbes.beliefs import FlowBelief
+from forbes.data import SequenceDataModule, Strokes
+from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, StateSpaceModel
+
+
+@pytest.fixture
+def data(strokes_file):
+    return SequenceDataModule(Strokes(path=str(strokes_file), validation=20), batch_size=4, length=6)
+
+
+@pytest.fixture
+def model():
+    torch.manual_seed(0)
+    shape = (1, 28, 28)
+    model = StateSpaceModel(FlowBelief, MLPEncoder(shape, 8, 1), MLPDecoder(6, shape, 8, 1), Bernoulli(), 0, 2, 4, 8, 1)
+    return model.eval()
+
+
+def seeded(model, batch, samples=3):
+    torch.manual_seed(0)
+    return complete(model, batch, 4, samples)
+
+
+def test_a_completion_has_a_frame_for_each_step_that_was_not_seen(model, data):
+    batch = data.sequences("test", torch.arange(5), 9)
+
+    completions = seeded(model, batch)
+
+    assert completions.frames.shape == (3, 5, 5, 1, 28, 28)
+    assert completions.frames.min() >= 0
+    assert completions.frames.max() <= 1
+    assert torch.equal(completions.at(5), completions.frames[:, :, 0])
+    assert torch.equal(completions.at(9), completions.frames[:, :, -1])
+
+
+def test_a_completion_knows_the_prefix_and_nothing_else(model, data):
+    batch = data.sequences("test", torch.arange(5), 9)
+    future = batch.observation.clone()
+    future[:, 4:] = 1 - future[:, 4:]
+    past = batch.observation.clone()
+    past[:, :4] = 1 - past[:, :4]
+
+    frames = seeded(model, batch).frames
+
+    assert torch.equal(seeded(model, batch._replace(observation=future)).frames, frames)
+    assert not torch.equal(seeded(model, batch._replace(observation=past)).frames, frames)
+
+
+def test_samples_of_one_prefix_differ(model, data):
+    frames = seeded(model, data.sequences("test", torch.arange(5), 9), samples=4).frames
+    assert len(frames.flatten(1).unique(dim=0)) == 4
+
+
+def test_a_sample_keeps_its_own_trajectory(model, data):
+    """Rolling on the n-th belief alone gives the n-th completion: rows never mix."""
+    batch = data.sequences("test", torch.arange(5), 9)
+    # Without the prior's noise the rest of a trajectory is a function of its start.
+    model.prior.rsample = lambda context, sample_shape=(): (context[:, :2], context[:, 0])
+    model.prior.sampler = lambda *bind: model.prior.rsample
+
+    together = seeded(model, batch)
+
+    with torch.no_grad():
+        torch.manual_seed(0)
+        filtered = model.filter(model.embed(batch.observation[:, :4]), batch.action[:, :4])
+        starts = model.beliefs(filtered, 3, 3)
+        for n in range(3):
+            for b in range(5):
+                row = n * 5 + b
+                start = type(starts)(starts.hidden[row : row + 1], starts.state[row : row + 1])
+                alone = model.decode(model.imagine(start, batch.action[b : b + 1, 4:]).features).sigmoid()
+                torch.testing.assert_close(together.frames[n, b], alone[0])
+
+
+def test_whole_sequences_end_with_the_longest_and_are_no_shorter_than_the_data(data):
+    index = torch.arange(12)
+    points = torch.from_numpy(data.source.arrays("test").offsets).diff()
+
+    batch = whole_sequences(data, "test", index)
+    assert batch.observation.shape[1] == points.max() > data.length
+    assert batch.mask.sum(1).tolist() == points.tolist()
+
+    shortest = points.argmin()[None]
+    assert whole_sequences(data, "test", shortest).observation.shape[1] == max(points.min(), data.length)
+
+
+@pytest.mark.parametrize("count", [3, 10, 15])
+def test_digits_are_chosen_class_by_class_and_in_order(data, count):
+    labels = data.source.labels("validation")
+
+    chosen = first_of_each_class(data, "validation", count)
+
+    assert labels[chosen].tolist() == [*range(10), *range(10)][:count]
+    first = {label: labels.tolist().index(label) for label in range(10)}
+    assert chosen[:10].tolist() == [first[label] for label in range(10)][:count]
