@@ -36,7 +36,7 @@ def deferred(steps: int, batch: int) -> Bind:
     def bind(weight: Tensor, bias: Tensor) -> Affine:
         inputs: list[Tensor] = []
         if torch.is_grad_enabled() and not torch.compiler.is_compiling():
-            shares = _Deferred.apply(weight, bias.expand(steps, batch, -1), inputs)  # (T, B, out)
+            shares = _Deferred.apply(weight, bias.expand(steps, batch, -1), inputs)  # type: ignore[no-untyped-call]
             matrix = weight.detach().T  # (in, out)
         else:  # nothing to defer, or the compiler orders the products itself
             shares, matrix = bias.expand(steps, batch, -1), weight.T  # (T, B, out), (in, out)

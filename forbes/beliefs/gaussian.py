@@ -20,7 +20,7 @@ def standard_normal_log_prob(noise: Tensor) -> Tensor:
 class GaussianBelief(BeliefHead):
     r"""Diagonal Gaussian.
 
-    .. math:: p(s \mid c) = N(s; \mu(c), \mathrm{diag}\,\sigma(c)^2), \qquad \sigma = \mathrm{softplus}(\cdot) + \sigma_{min}
+    .. math:: p(s \mid c) = N(s; \mu(c), \mathrm{diag}\,\sigma(c)^2), \ \sigma = \mathrm{softplus}(\cdot) + \sigma_{min}
 
     Args:
         state_dim: D.

@@ -88,12 +88,24 @@ class MLPDecoder(Decoder):
         observation_shape: (C, H, W).
         width: width of each hidden layer.
         layers: how many hidden layers.
+        output_bias: the output it starts from; the logit of the mean pixel, -4 for strokes, saves the first thousand
+            updates of learning that most pixels are off.
     """
 
-    def __init__(self, feature_dim: int, observation_shape: tuple[int, ...], width: int = 200, layers: int = 2) -> None:
+    def __init__(
+        self,
+        feature_dim: int,
+        observation_shape: tuple[int, ...],
+        width: int = 200,
+        layers: int = 2,
+        output_bias: float = 0.0,
+    ) -> None:
         super().__init__()
         self.observation_shape = observation_shape
-        self.net = nn.Sequential(perceptron(feature_dim, width, layers), nn.Linear(width, math.prod(observation_shape)))
+        last = nn.Linear(width, math.prod(observation_shape))
+        if output_bias:
+            nn.init.constant_(last.bias, output_bias)
+        self.net = nn.Sequential(perceptron(feature_dim, width, layers), last)
 
     def forward(self, features: Tensor) -> Tensor:
         """See `Decoder`."""
