@@ -62,8 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"forbes: {_sentence(error)}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        if debug:
+    except (KeyboardInterrupt, SystemExit) as error:
+        interrupt = error if isinstance(error, KeyboardInterrupt) else error.__context__  # Lightning exits with 1
+        if debug or not isinstance(interrupt, KeyboardInterrupt):
             raise
         return 130
 

@@ -12,8 +12,9 @@ from rich.console import Console
 from rich.table import Column, Table
 
 import forbes
-from forbes.data.strokes import bundled_path, dejong_path
-from forbes.errors import ForbesError
+from forbes.arguments import ArgumentParser
+from forbes.data.dejong import dejong_path
+from forbes.data.strokes import bundled_path
 
 __all__ = ["main"]
 
@@ -34,11 +35,9 @@ class Finding(NamedTuple):
 
 def main(arguments: Sequence[str]) -> int:
     """Print the report; 0 when `make fit` can work here, else 1."""
-    if arguments:
-        if arguments[0] in ("--help", "-h"):
-            print("usage: forbes doctor\n\nSay what this machine has and lacks, each lack with its remedy.")
-            return 0
-        raise ForbesError(f"doctor: takes no arguments, got {' '.join(arguments)}. Call it without")
+    ArgumentParser("forbes doctor", "Say what this machine has and lacks, each lack with its remedy.").parse_args(
+        arguments
+    )
     table = Table("", Column("found", overflow="fold"), Column("what to do", overflow="fold"), box=None)
     findings = [*_software(), *_hardware(), *_data()]
     for finding in findings:

@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import CheckpointIO
+from lightning.pytorch.callbacks import Checkpoint
 
 from forbes.errors import ForbesError
+from forbes.training.run_folder import RunFolder
 
-__all__ = ["AtomicCheckpointIO", "read_checkpoint"]
+__all__ = ["AtomicCheckpointIO", "SaveLast", "read_checkpoint"]
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -55,6 +58,23 @@ class AtomicCheckpointIO(CheckpointIO):
     def remove_checkpoint(self, path: str | os.PathLike[str]) -> None:
         """Delete a checkpoint."""
         Path(path).unlink(missing_ok=True)
+
+
+class SaveLast(Checkpoint):
+    """Saves after each epoch, over the checkpoint before.
+
+    Lightning's `ModelCheckpoint` remembers where it saved, and is lost in a run folder that was moved.
+
+    Args:
+        run: where the checkpoint goes.
+    """
+
+    def __init__(self, run: RunFolder) -> None:
+        self.run = run
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save; every other callback has ended its epoch."""
+        trainer.save_checkpoint(self.run.checkpoint)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

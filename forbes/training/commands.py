@@ -13,15 +13,15 @@ from typing import Any
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import CheckpointIO
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
+from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 import forbes.training.callbacks  # noqa: F401  so that configurations know them by their short names
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
-from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
-from forbes.training.config_errors import one_sentence
+from forbes.training.checkpoint import AtomicCheckpointIO, SaveLast, read_checkpoint
+from forbes.training.config_errors import one_sentence, raised_inside
 from forbes.training.configuration import add_links, add_seed, allow_modules
 from forbes.training.loading import check_weights
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
@@ -45,6 +45,8 @@ _NOT_OURS = (  # warnings that say nothing true or useful here
     ".*dataloader is not resumable.*",  # it goes on from the trainer's update
     ".*`IterableDataset` has `__len__` defined.*",  # there are no workers
     ".*treespec, LeafSpec.*",  # Lightning 2.6 calls torch 2.13 the old way
+    "(?s).*JsonargparseDeprecationWarning",  # and jsonargparse 4.53
+    "(?s).*instantiate_classes",
 )
 
 
@@ -82,6 +84,10 @@ def _run(command: str, arguments: Sequence[str]) -> int:
             raise ForbesError(one_sentence(str(error), arguments)) from error
         except MisconfigurationException as error:
             raise ForbesError(" ".join(str(error).split())) from error
+        except ValueError as error:
+            if inner := raised_inside(error):
+                raise inner from None
+            raise
 
 
 class _Experiment(LightningCLI):
@@ -130,7 +136,9 @@ class _Experiment(LightningCLI):
         """Add the links, and the checkpoint for the commands that need one."""
         add_links(parser)
         if self.command != "fit":
-            parser.add_argument("--ckpt_path", type=str, help="a trained model: runs/.../checkpoints/last.ckpt")
+            parser.add_argument(
+                "--ckpt_path", type=str, required=True, help="a trained model: runs/.../checkpoints/last.ckpt"
+            )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse; Lightning's own would warn that the process has arguments, too."""
@@ -160,8 +168,7 @@ class _Experiment(LightningCLI):
         self.save_config_kwargs = {"run": run, "stop": self.stop, "arguments": [self.command, *self.arguments]}
         callbacks += [MarkStart(), self.stop]
         if config["enable_checkpointing"] is not False:
-            folder, name = run.checkpoint.parent, run.checkpoint.stem
-            callbacks.append(ModelCheckpoint(folder, name, save_on_train_epoch_end=True, enable_version_counter=False))
+            callbacks.append(SaveLast(run))
         loggers = config["logger"]
         if loggers is not False:
             loggers = [JsonLinesLogger(run.metrics), *_as_list(None if loggers is True else loggers)]

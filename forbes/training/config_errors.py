@@ -6,14 +6,16 @@ import itertools
 import pydoc
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 from lightning import Callback, LightningDataModule, Trainer
 from lightning.pytorch.loggers import Logger
 from torch import nn
 
 from forbes.data import SequenceSource
+from forbes.errors import ForbesError
 
-__all__ = ["one_sentence"]
+__all__ = ["one_sentence", "raised_inside"]
 
 TOP_LEVEL = ("model", "data", "trainer", "seed_everything", "config", "ckpt_path")
 CONFIGURABLE = (nn.Module, LightningDataModule, SequenceSource, Callback, Logger)
@@ -104,4 +106,16 @@ def _place(key: str, arguments: Sequence[str]) -> str:
     if key and f"--{key}" in flags:
         return ""
     configs = [value for flag, value in itertools.pairwise(arguments) if flag in ("--config", "-c")]
-    return f"{configs[-1]}: " if configs else ""
+    word = re.compile(rf"\b{re.escape(key.rpartition('.')[2])}\b")
+    for config in configs[::-1]:
+        if len(configs) == 1 or word.search(Path(config).read_text()):
+            return f"{config}: "
+    return ""
+
+
+def raised_inside(error: BaseException) -> ForbesError | None:
+    """Find the error of ours that a constructor has raised, under what jsonargparse makes of it."""
+    inner: BaseException | None = error
+    while inner is not None and not isinstance(inner, ForbesError):
+        inner = inner.__cause__
+    return inner

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.training.checkpoint import read_checkpoint
-from forbes.training.config_errors import one_sentence
+from forbes.training.config_errors import one_sentence, raised_inside
 from forbes.training.configuration import allow_modules, experiment_parser
 from forbes.training.run_folder import RunFolder
 from forbes.training.world_model import WorldModel
@@ -35,7 +35,12 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
         )
     except argparse.ArgumentError as error:
         raise ForbesError(f"{folder.config}: {one_sentence(str(error))}") from error
-    built = parser.instantiate_classes(parsed)
+    try:
+        built = parser.instantiate(parsed)
+    except ValueError as error:
+        if inner := raised_inside(error):
+            raise inner from None
+        raise
     check_weights(built.model, state, str(folder.checkpoint))
     built.model.load_state_dict(state)
     return built.model.eval(), built.data

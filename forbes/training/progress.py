@@ -1,5 +1,6 @@
 """Progress of a training: a bar on a terminal, one plain line an epoch in a log file."""
 
+import math
 import sys
 import time
 from datetime import timedelta
@@ -54,15 +55,17 @@ class PlainProgress(ProgressBar):
             return
         elapsed = time.monotonic() - self._start
         rate = (trainer.global_step - self._first) / elapsed
-        total = trainer.estimated_stepping_batches
+        total = trainer.estimated_stepping_batches  # infinite for max_epochs: -1
+        ends = math.isfinite(total)
         fields = [
-            f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}",
-            f"update {trainer.global_step}/{total}",
+            f"epoch {trainer.current_epoch + 1}" + f"/{trainer.max_epochs}" * ends,
+            f"update {trainer.global_step}" + f"/{total}" * ends,
             str(timedelta(seconds=round(elapsed))),
             f"{rate:.1f} updates/s",
             *(f"{name} {value:.1f}" for name, value in _elbos(trainer).items()),
-            f"left {timedelta(seconds=round((total - trainer.global_step) / rate))}",
         ]
+        if ends:
+            fields.append(f"left {timedelta(seconds=round((total - trainer.global_step) / rate))}")
         print("  ".join(fields), flush=True)
 
 

@@ -19,7 +19,8 @@ from lightning.pytorch.cli import LightningArgumentParser, SaveConfigCallback
 
 import forbes
 from forbes.errors import ForbesError
-from forbes.training.run_folder import RunFolder, replace_text
+from forbes.files import replace_file
+from forbes.training.run_folder import RunFolder
 from forbes.training.stop import StopOnSignal
 
 __all__ = ["RecordRun", "commit"]
@@ -54,7 +55,7 @@ class RecordRun(SaveConfigCallback):
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Write both files before the training starts."""
-        replace_text(self.run.config, self.parser.dump(self.config, skip_none=False))
+        replace_file(self.run.config, self.parser.dump(self.config, skip_unset=False).encode())
         path = self.run.provenance
         self._entries: list[dict[str, Any]] = json.loads(path.read_text()) if path.is_file() else []
         seed = {"seed": self.config["seed_everything"]}
@@ -79,7 +80,7 @@ class RecordRun(SaveConfigCallback):
             self._write()
 
     def _write(self) -> None:
-        replace_text(self.run.provenance, json.dumps(self._entries, indent=2) + "\n")
+        replace_file(self.run.provenance, json.dumps(self._entries, indent=2).encode() + b"\n")
 
 
 def _describe(arguments: Sequence[str]) -> dict[str, Any]:

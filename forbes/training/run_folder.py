@@ -14,7 +14,7 @@ import pandas as pd
 
 from forbes.errors import ForbesError
 
-__all__ = ["RunFolder", "experiment_name", "read_metrics", "replace_text"]
+__all__ = ["RunFolder", "experiment_name", "read_metrics"]
 
 
 class RunFolder:
@@ -115,7 +115,7 @@ def read_metrics(run: Path | str) -> pd.DataFrame:
         try:
             record = json.loads(line)
             update = record.pop("update")
-        except (ValueError, KeyError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ForbesError(f"{path}: line {number} is not a line of metrics. Repair or delete it") from error
         if record.pop("start", False):
             rows = {known: row for known, row in rows.items() if known <= update}
@@ -132,10 +132,3 @@ def _replace_content(file: TextIO, content: str) -> None:
     file.truncate()
     file.write(content)
     file.flush()
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a file so that a kill leaves the old content or the new, never half."""
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_text(text)
-    temporary.replace(path)

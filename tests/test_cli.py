@@ -1,0 +1,275 @@
+"""The command line: what it lists, what it leaves behind, and each bad input as one sentence and exit code 2."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from forbes import __version__
+from forbes.cli import COMMANDS, main
+from forbes.training import WorldModel
+from forbes.training.run_folder import RunFolder, read_metrics
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+
+
+def test_help_is_fast_because_it_does_not_import_torch():
+    program = (
+        "import sys, forbes.cli; forbes.cli.main(['--help']); assert not {'torch', 'lightning'} & set(sys.modules)"
+    )
+    seconds = []
+    for _ in range(3):  # the machine may be busy
+        start = time.perf_counter()
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+        seconds.append(time.perf_counter() - start)
+
+    assert min(seconds) < 0.5
+    for name in COMMANDS:
+        assert f"forbes {name}" in done.stdout
+
+
+def test_the_package_and_the_script_are_the_same_program():
+    script = Path(sys.executable).with_name("forbes")
+    outputs = {
+        subprocess.run([*program, "--version"], capture_output=True, text=True, check=True).stdout
+        for program in ([str(script)], [sys.executable, "-m", "forbes"])
+    }
+
+    assert outputs == {f"forbes {__version__}\n"}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_explains_itself(name, capsys):
+    try:
+        status = main([name, "--help"])
+    except SystemExit as done:
+        status = done.code
+
+    assert status == 0
+    assert f"usage: forbes {name}" in capsys.readouterr().out
+
+
+def error_of(capsys, *arguments):
+    """Run a command that must fail with one sentence and nothing else, and give the sentence."""
+    assert main(list(arguments)) == 2
+    output = capsys.readouterr().err
+    assert output.startswith("forbes: ")
+    assert output.count("\n") == 1
+    return output.removeprefix("forbes: ").strip()
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (
+            ["--model.learning_rte", "1"],
+            "model.learning_rte: WorldModel has no such option, did you mean learning_rate?",
+        ),
+        (["--model.belief.layer", "1"], "model.belief.layer: FlowBelief has no such option, did you mean layers?"),
+        (["--data.source.point_per_step", "2"], "Strokes has no such option, did you mean points_per_step?"),
+        (["--trainer.max_epoch", "3"], "trainer.max_epoch: Trainer has no such option, did you mean max_epochs?"),
+        (["--modle.kl", "analytic"], "modle: the configuration has no such option, did you mean model?"),
+        (["--model.belief", "FlowBelef"], "no class FlowBelef that fits here, did you mean FlowBelief?"),
+        (["--data.source", "FlowBelief"], "no class FlowBelief that fits here"),
+        (
+            ["--trainer.callbacks", "PredictionGri"],
+            "no class PredictionGri that fits here, did you mean PredictionGrid?",
+        ),
+        (["--model.learning_rate", "fast"], "model.learning_rate: is fast, expected float"),
+        (["--model.kl", "exact"], "model.kl: is exact, expected one of ['analytic', 'monte_carlo']"),
+        (["--trainer.max_epochs", "many"], "trainer.max_epochs: is many, expected int or null"),
+        (["--data.length", "0"], "length is 0, expected at least 1"),
+        (["--data.batch_size", "-1"], "batch_size is -1, expected at least 1"),
+        (["--data.batch_size", "33"], "batch_size is 33, but the training split has 32 sequences"),
+        (["--trainer.devices", "0"], "devices"),
+        (["surplus"], "unrecognized arguments: surplus"),
+        (["--config", "absent.yaml"], "absent.yaml: no such file"),
+        (["--resume", "absent"], "absent: no such run folder"),
+        (["--run_dir", "/proc/run"], "/proc/run: no such file or directory"),
+        (["--resume", "a", "--run_dir", "b"], "not allowed with argument"),
+        (["--allow-module", "no_such_module"], "--allow-module no_such_module: No module named 'no_such_module'"),
+        (["--allow-module"], "--allow-module: no name follows"),
+    ],
+)
+def test_a_wrong_flag_is_one_sentence(flags, expected, tiny_config, in_tmp_path, capsys):
+    assert expected in error_of(capsys, "fit", "--config", str(tiny_config), *flags)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("modle: {class_path: WorldModel}", "modle: the configuration has no such option, did you mean model?"),
+        ("model: {class_path: WorldModl}", "model: no class WorldModl that fits here, did you mean WorldModel?"),
+        (
+            "model: {class_path: WorldModel, init_args: {hiden_dim: 3}}",
+            "model.hiden_dim: WorldModel has no such option, did you mean hidden_dim?",
+        ),
+        ("data: {class_path: SequenceDataModule, init_args: {length: 2.5}}", "data.length: is 2.5, expected int"),
+        ("trainer: {max_epoch: 3}", "trainer.max_epoch: Trainer has no such option, did you mean max_epochs?"),
+        ("trainer: {max_epochs: many}", "trainer.max_epochs: is many, expected int or null"),
+    ],
+)
+def test_a_wrong_line_of_a_configuration_is_one_sentence(change, expected, tiny_config, in_tmp_path, capsys):
+    Path("bad.yaml").write_text(change)
+
+    for configs in (["--config", str(tiny_config), "--config", "bad.yaml"], ["--config", "bad.yaml"]):
+        assert error_of(capsys, "fit", *configs) == f"bad.yaml: {expected}"
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize("text", ["model: {class_path: WorldModel", "- 1", "", "model: 3"])
+def test_a_file_that_is_no_configuration_is_one_sentence(text, in_tmp_path, capsys):
+    Path("bad.yaml").write_text(text)
+
+    assert "bad.yaml" in error_of(capsys, "fit", "--config", "bad.yaml")
+
+
+def test_an_unknown_command_suggests_the_nearest(capsys):
+    assert error_of(capsys, "fti") == "fti: no such command. Did you mean fit?"
+
+
+def test_debug_shows_the_traceback(in_tmp_path):
+    with pytest.raises(Exception, match="no such run folder"):
+        main(["--debug", "fit", "--resume", "absent"])
+
+
+def test_a_configuration_cannot_run_a_foreign_module_unless_allowed(tiny_config, in_tmp_path, monkeypatch, capsys):
+    Path("stranger.py").write_text(
+        "import pathlib\n"
+        "from forbes.beliefs import GaussianBelief\n"
+        "pathlib.Path('executed').touch()\n"
+        "class MyBelief(GaussianBelief): ...\n"
+    )
+    monkeypatch.syspath_prepend(str(in_tmp_path))
+    flags = ["fit", "--config", str(tiny_config), "--model.belief", "stranger.MyBelief"]
+
+    sentence = error_of(capsys, *flags)
+
+    assert "stranger.MyBelief is not of forbes, lightning or torch. If you trust it, add: --allow-module" in sentence
+    assert not Path("executed").exists()
+    assert main([*flags, "--allow-module", "stranger"]) == 0
+    assert Path("executed").exists()
+
+
+def test_a_run_folder_is_named_after_its_configuration_and_holds_all_of_the_run(tiny_config, in_tmp_path, capsys):
+    assert main(["fit", "--config", str(tiny_config), "--seed_everything", "7"]) == 0
+
+    (run,) = Path("runs/tiny/forbes").iterdir()
+    assert run.name.endswith("-7")
+    assert f"run folder: {run}" in capsys.readouterr().out
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["seed_everything"] == 7
+    assert config["model"]["class_path"] == "forbes.training.WorldModel"
+    assert config["model"]["init_args"]["clip_norm"] == 100.0  # a default: the file holds all
+    (start,) = json.loads((run / "provenance.json").read_text())
+    assert start["seed"] == 7
+    assert start["exit_status"] == 0
+    assert start["command"].startswith("forbes fit --config ")
+    assert start["versions"]["forbes"] == __version__
+    assert read_metrics(run).index.max() == 10
+    assert (run / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_a_run_can_be_named(tiny_config, in_tmp_path):
+    one_epoch = ["fit", "--config", str(tiny_config), "--trainer.max_epochs", "1"]
+
+    assert main([*one_epoch, "--experiment", "mine"]) == 0
+    assert main([*one_epoch, "--run_dir", "here"]) == 0
+
+    assert len(list(Path("runs/mine").iterdir())) == 1
+    assert Path("here/checkpoints/last.ckpt").is_file()
+
+
+def test_a_trained_run_is_not_trained_over(tiny_config, tiny_run, capsys):
+    before = (tiny_run / "metrics.jsonl").read_bytes()
+
+    sentence = error_of(capsys, "fit", "--config", str(tiny_config), "--run_dir", str(tiny_run))
+
+    assert (
+        sentence == f"{tiny_run}: holds a trained run. Name another, or go on with it: forbes fit --resume {tiny_run}"
+    )
+    assert (tiny_run / "metrics.jsonl").read_bytes() == before
+
+
+def test_two_processes_never_train_in_one_folder(tiny_run, capsys):
+    with RunFolder(tiny_run).locked():
+        assert "trains here" in error_of(capsys, "fit", "--resume", str(tiny_run))
+
+
+def test_each_start_of_a_run_is_recorded_with_its_end(tiny_config, in_tmp_path, monkeypatch):
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", "run"]) == 0
+    resume = ["fit", "--resume", "run", "--trainer.max_epochs", "3"]
+    with monkeypatch.context() as patch:
+        patch.setattr(WorldModel, "training_step", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            main(resume)
+    assert main(resume) == 0
+
+    starts = json.loads(Path("run/provenance.json").read_text())
+
+    assert [start["exit_status"] for start in starts] == [0, 1, 0]
+    assert starts[1]["command"] == "forbes fit --resume run --trainer.max_epochs 3"
+    assert read_metrics("run").index.max() == 15
+
+
+def test_loggers_of_the_configuration_come_beside_ours(tiny_config, in_tmp_path):
+    flags = ["--trainer.logger", "CSVLogger", "--trainer.logger.save_dir", "csv", "--run_dir", "run"]
+
+    assert main(["fit", "--config", str(tiny_config), *flags]) == 0
+
+    assert list(Path("csv").rglob("metrics.csv"))
+    assert read_metrics("run").index.max() == 10
+
+
+def test_a_trainer_that_is_told_to_leave_nothing_leaves_the_record_of_the_run_only(tiny_config, in_tmp_path):
+    flags = ["--trainer.logger", "false", "--trainer.enable_checkpointing", "false", "--run_dir", "run"]
+
+    assert main(["fit", "--config", str(tiny_config), *flags]) == 0
+
+    assert {path.name for path in Path("run").iterdir()} == {".lock", "config.yaml", "provenance.json"}
+
+
+def test_a_dry_run_leaves_nothing(tiny_config, in_tmp_path):
+    assert main(["fit", "--config", str(tiny_config), "--trainer.fast_dev_run", "true"]) == 0
+
+    assert list(in_tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["validate", "test", "predict"])
+def test_a_trained_model_runs_through_the_other_loops(command, tiny_run, in_tmp_path):
+    flags = ["--config", f"{tiny_run}/config.yaml", "--ckpt_path", f"{tiny_run}/checkpoints/last.ckpt"]
+
+    assert main([command, *flags]) == 0
+
+    assert list(in_tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["validate", "test", "predict"])
+def test_the_other_loops_need_a_trained_model(command, tiny_config, capsys):
+    assert "ckpt_path missing" in error_of(capsys, command, "--config", str(tiny_config))
+    assert "absent: no such checkpoint" in error_of(
+        capsys, command, "--config", str(tiny_config), "--ckpt_path", "absent"
+    )
+
+
+@pytest.mark.parametrize("config", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: str(path.relative_to(CONFIGS)))
+def test_every_configuration_trains(config, in_tmp_path):
+    base = [] if "model" in yaml.safe_load(config.read_text()) else ["--config", f"{CONFIGS}/strokes/forbes.yaml"]
+    small = {
+        "data.source.origin": "bundled",  # the paper's set is not in the repository
+        "data.batch_size": 4,
+        "data.updates_per_epoch": 1,
+        "data.validation_sequences": 4,
+        "trainer.max_epochs": 1,
+        "trainer.log_every_n_steps": 1,
+        "trainer.accelerator": "cpu",
+    }
+    flags = [f"--{name}={value}" for name, value in small.items()]
+
+    assert main(["fit", *base, "--config", str(config), *flags, "--run_dir", "run"]) == 0
+
+    assert Path("run/checkpoints/last.ckpt").is_file()

@@ -1,0 +1,93 @@
+"""A loaded run is the trained one, or one sentence says why not."""
+
+import re
+import shutil
+
+import pytest
+import torch
+import yaml
+
+from forbes.cli import main
+from forbes.errors import ForbesError
+from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.training.loading import load_run
+from forbes.training.run_folder import RunFolder
+
+
+@pytest.fixture
+def run(tiny_run, tmp_path):
+    """A copy to break."""
+    shutil.copytree(tiny_run, tmp_path / "run")
+    return RunFolder(tmp_path / "run")
+
+
+def configure(run, change):
+    config = yaml.safe_load(run.config.read_text())
+    change(config)
+    run.config.write_text(yaml.safe_dump(config))
+
+
+def test_a_loaded_model_has_the_weights_and_gives_the_outputs_of_the_trained_one(tiny_run):
+    model, data = load_run(tiny_run)
+    again, _ = load_run(str(tiny_run))
+
+    saved = read_checkpoint(RunFolder(tiny_run).checkpoint)["state_dict"]
+    torch.testing.assert_close(dict(model.state_dict()), dict(saved), rtol=0, atol=0)
+    assert not model.training
+    assert data.batch_size == 4
+    batch = data.sequences("test", torch.arange(5))
+    outputs = []
+    for one in (model, again):
+        torch.manual_seed(0)
+        outputs.append(one.terms(batch).elbo)
+    torch.testing.assert_close(*outputs, rtol=0, atol=0)
+
+
+def test_a_run_without_a_checkpoint_is_one_sentence(run):
+    run.checkpoint.unlink()
+
+    with pytest.raises(ForbesError, match=r"run: has no checkpoint yet\. Train it: forbes fit --config .*config\.yaml"):
+        load_run(run.path)
+
+
+def test_a_checkpoint_of_another_family_is_one_sentence(run):
+    configure(run, lambda config: config["model"]["init_args"].update(belief={"class_path": "GaussianBelief"}))
+
+    with pytest.raises(ForbesError, match=r"last\.ckpt: it has no model\.prior\.\S+, which .*: another belief family"):
+        load_run(run.path)
+
+
+def test_a_checkpoint_that_lacks_a_tensor_is_one_sentence(run):
+    checkpoint = read_checkpoint(run.checkpoint)
+    name = next(iter(checkpoint["state_dict"]))
+    del checkpoint["state_dict"][name]
+    AtomicCheckpointIO().save_checkpoint(checkpoint, run.checkpoint)
+
+    with pytest.raises(ForbesError, match=rf"last\.ckpt: it has no {re.escape(name)}, which the configured model has"):
+        load_run(run.path)
+
+
+def test_a_checkpoint_of_another_size_is_one_sentence_with_both_shapes(run):
+    configure(run, lambda config: config["model"]["init_args"].update(hidden_dim=5))
+
+    with pytest.raises(
+        ForbesError, match=r"last\.ckpt: its model\.\S+ is \([\d, ]+\), that of the configured model \("
+    ):
+        load_run(run.path)
+
+
+def test_a_configuration_of_another_version_is_one_sentence(run):
+    configure(run, lambda config: config["model"]["init_args"].update(learnin_rate=1))
+
+    with pytest.raises(ForbesError, match=r"config\.yaml: model\.learnin_rate: .*did you mean learning_rate\?"):
+        load_run(run.path)
+
+
+def test_a_run_does_not_go_on_with_another_family(run, capsys):
+    before = run.config.read_text()
+
+    status = main(["fit", "--resume", str(run), "--model.belief", "GaussianBelief"])
+
+    assert status == 2
+    assert "last.ckpt: it has no model.prior." in capsys.readouterr().err
+    assert run.config.read_text() == before

@@ -1,0 +1,117 @@
+"""A training that was interrupted and resumed gives the same numbers, bit for bit on the CPU."""
+
+import os
+import shutil
+import signal
+
+import pandas as pd
+import pytest
+import torch
+
+from forbes.cli import main
+from forbes.training import WorldModel
+from forbes.training.checkpoint import read_checkpoint
+from forbes.training.run_folder import RunFolder, read_metrics
+
+FOUR_EPOCHS = ["--trainer.max_epochs", "4"]  # of five updates
+
+
+@pytest.fixture(scope="module")
+def straight(tiny_config, tmp_path_factory):
+    run = tmp_path_factory.mktemp("runs") / "straight"
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run), *FOUR_EPOCHS]) == 0
+    return run
+
+
+def assert_same_run(one, other):
+    pd.testing.assert_frame_equal(read_metrics(one), read_metrics(other), check_exact=True)
+    state, expected = (read_checkpoint(RunFolder(run).checkpoint) for run in (one, other))
+    assert state["global_step"] == expected["global_step"]
+    for part in ("state_dict", "optimizer_states"):
+        torch.testing.assert_close(state[part], expected[part], rtol=0, atol=0)
+
+
+def test_two_epochs_and_two_more_are_four_epochs(straight, tiny_run, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(tiny_run, run)
+
+    assert main(["fit", "--resume", str(run), *FOUR_EPOCHS]) == 0
+
+    assert_same_run(run, straight)
+
+
+@pytest.mark.parametrize(
+    "schedule",
+    [
+        "constant",
+        pytest.param(
+            "cosine", marks=pytest.mark.xfail(strict=True, reason="the loader is made before the update is known")
+        ),
+    ],
+)
+def test_updates_after_the_last_checkpoint_are_made_again(tiny_config, tmp_path, monkeypatch, schedule):
+    """What SIGKILL leaves: metrics that are ahead of the checkpoint."""
+    fit = ["fit", "--config", str(tiny_config), *FOUR_EPOCHS, "--model.schedule", schedule, "--run_dir"]
+    straight, run = str(tmp_path / "straight"), str(tmp_path / "run")
+    assert main([*fit, straight]) == 0
+
+    class Killed(BaseException):
+        pass
+
+    def kill(self, loss):
+        if self.global_step == 13:
+            raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(WorldModel, "on_before_backward", kill)
+        with pytest.raises(Killed):
+            main([*fit, run])
+    assert read_metrics(run).index.max() == 13
+    assert read_checkpoint(RunFolder(run).checkpoint)["global_step"] == 10
+
+    assert main(["fit", "--resume", run]) == 0
+
+    assert_same_run(run, straight)
+
+
+MIDDLE, BEFORE_LAST, LAST_OF_EPOCH, LAST = 6, 8, 9, 19
+
+
+@pytest.mark.parametrize(
+    ("number", "update", "stops_at"),
+    [
+        (signal.SIGINT, MIDDLE, 8),
+        (signal.SIGTERM, 0, 2),
+        (signal.SIGTERM, MIDDLE, 8),
+        (signal.SIGTERM, BEFORE_LAST, 10),  # not between the epoch's last update and its validation
+        (signal.SIGTERM, LAST_OF_EPOCH, 10),
+        (signal.SIGTERM, LAST, 20),
+    ],
+)
+def test_a_signal_stops_a_training_where_it_can_go_on(
+    straight, tiny_config, tmp_path, monkeypatch, capsys, number, update, stops_at
+):
+    def interrupt(self, loss):
+        if self.global_step == update:
+            os.kill(os.getpid(), number)
+
+    run = str(tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(WorldModel, "on_before_backward", interrupt)
+        status = main(["fit", "--config", str(tiny_config), "--run_dir", run, *FOUR_EPOCHS])
+
+    assert status == 128 + number
+    assert read_checkpoint(RunFolder(run).checkpoint)["global_step"] == stops_at
+    assert f"stopped at update {stops_at}, go on with: forbes fit --resume {run}" in capsys.readouterr().out
+    assert main(["fit", "--resume", run]) == 0
+    assert_same_run(run, straight)
+
+
+def test_a_second_signal_stops_at_once(tiny_config, tmp_path, monkeypatch):
+    def interrupt(self, loss):
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(WorldModel, "on_before_backward", interrupt)
+    with pytest.raises(SystemExit, match=str(128 + signal.SIGTERM)):
+        main(["fit", "--config", str(tiny_config), "--run_dir", str(tmp_path / "run")])
