@@ -1,0 +1,177 @@
+"""What an update costs: flow against Gaussian, ours against the textbook form, compiled against eager, and the memory.
+
+    python benchmarks/train_step.py                one thread; writes the table beside this file
+
+All forms of a shape take turns, one update each, so that whatever else the machine does meets them alike. Times are
+medians of processor time, which other programs disturb less than the clock on the wall; with one thread both are the
+same on an idle machine. The table is about their ratios. Memory is measured in a fresh process per form.
+"""
+
+import argparse
+import multiprocessing
+import os
+import platform
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+import yaml
+from textbook import Textbook
+from torch import Tensor
+
+from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.data import SequenceBatch
+from forbes.models import elbo_loss
+from forbes.training import WorldModel
+from forbes.training.configuration import allow_modules, experiment_parser
+
+ROOT = Path(__file__).parents[1]
+SHAPES = ("strokes", "dmc")
+FORMS = ("gaussian", "flow", "textbook")
+ACTIONS = 6  # of cheetah-run
+TOLERANCE = 1e-4  # relative, between the losses of ours and the textbook form
+
+
+def strokes(form: str) -> tuple[WorldModel, SequenceBatch]:
+    """Build the default experiment on digit strokes and its first batch."""
+    allow_modules()
+    name = "rssm.yaml" if form == "gaussian" else "forbes.yaml"
+    config = yaml.safe_load((ROOT / "configs" / "strokes" / name).read_text())
+    parser = experiment_parser()
+    built = parser.instantiate(parser.parse_object({name: config[name] for name in ("model", "data")}))
+    return built.model, built.data.sequences("train", built.data.train_index(0))
+
+
+def dmc(form: str, batch: int) -> tuple[WorldModel, SequenceBatch]:
+    """Build the paper's model for DeepMind Control, whose sizes are the class defaults, and a batch of noise."""
+    world = WorldModel(GaussianBelief if form == "gaussian" else FlowBelief, action_dim=ACTIONS)
+    shape = (batch, 50)
+    observation = torch.randint(256, (*shape, 3, 64, 64), dtype=torch.uint8)
+    mask = torch.ones(shape, dtype=torch.bool)
+    return world, SequenceBatch(observation, torch.rand(*shape, ACTIONS), torch.zeros(shape), mask)
+
+
+class Update:
+    """One update of a model on one batch, as `WorldModel` makes it: loss, gradients, clipping, Adam."""
+
+    def __init__(self, shape: str, form: str, dmc_batch: int) -> None:
+        torch.manual_seed(0)
+        self.world, self.batch = strokes(form) if shape == "strokes" else dmc(form, dmc_batch)
+        with torch.no_grad():  # an untrained flow is the identity, and nothing would be compared
+            for parameter in self.world.parameters():
+                parameter += 0.02 * torch.randn_like(parameter)
+        self.model = Textbook(self.world.model) if form == "textbook" else self.world.model
+        self.loss: Callable[[], Tensor] = self.eager_loss
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-5, eps=1e-7, fused=True)
+
+    def eager_loss(self) -> Tensor:
+        """Give the training loss."""
+        terms = self.model.elbo(self.batch.observation, self.batch.action, self.batch.mask)
+        return elbo_loss(terms, self.world.free_nats, self.world.free_nats_per)
+
+    def loss_of_noise(self, seed: int) -> float:
+        """Give the loss with the noise of a seed."""
+        torch.manual_seed(seed)
+        with torch.no_grad():
+            return self.eager_loss().item()
+
+    def __call__(self) -> float:
+        """Make the update and give the seconds of processor time it took."""
+        start = time.process_time()
+        self.optimizer.zero_grad()
+        self.loss().backward()
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.world.clip_norm, foreach=True)
+        self.optimizer.step()
+        return time.process_time() - start
+
+
+def interleaved(updates: dict[str, Update], repeats: int) -> dict[str, float]:
+    """Time updates in turns: medians in seconds, after two rounds that do not count."""
+    seconds: dict[str, list[float]] = {form: [] for form in updates}
+    for _ in range(repeats + 2):
+        for form, update in updates.items():
+            seconds[form].append(update())
+    return {form: statistics.median(times[2:]) for form, times in seconds.items()}
+
+
+def compiled(update: Update) -> float:
+    """Compile the loss of an update without graph breaks and give the seconds until the first update is done."""
+    start = time.perf_counter()
+    update.loss = torch.compile(update.eager_loss, fullgraph=True)
+    update()
+    return time.perf_counter() - start
+
+
+def memory(shape: str, form: str, threads: int, dmc_batch: int) -> float:
+    """Give the MiB that two updates add to a process that holds model and batch."""
+    torch.set_num_threads(threads)
+    update = Update(shape, form, dmc_batch)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for _ in range(2):
+        update()
+    unit = 2**20 if platform.system() == "Darwin" else 2**10
+    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / unit
+
+
+def say(line: str) -> None:
+    """Report progress."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def measure(shape: str, options: argparse.Namespace) -> list[str]:
+    """Measure one shape: the rows of the table."""
+    memories = {}
+    for form in FORMS:  # first, since a child's peak begins at its parent's size
+        say(f"{shape}: memory of {form}")
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            memories[form] = pool.apply(memory, (shape, form, options.threads, options.dmc_batch))
+    updates = {form: Update(shape, form, options.dmc_batch) for form in FORMS}
+    ours, theirs = updates["flow"].loss_of_noise(0), updates["textbook"].loss_of_noise(0)
+    assert abs(ours - theirs) <= TOLERANCE * abs(theirs), f"losses differ: {ours} and {theirs}"
+    say(f"{shape}: loss {ours:.4f}, textbook {theirs:.4f}; {options.repeats} rounds")
+    rows = dict.fromkeys(FORMS, "")
+    if shape in options.compile:
+        updates["compiled"] = Update(shape, "flow", options.dmc_batch)
+        say(f"{shape}: compiling")
+        rows["compiled"] = f" ({compiled(updates['compiled']):.0f} s to compile)"
+    seconds = interleaved(updates, options.repeats)
+    return [
+        f"| {shape} | {form}{note} | {1e3 * seconds[form]:.1f} | {seconds[form] / seconds['gaussian']:.2f} "
+        f"| {seconds['flow'] / seconds[form]:.2f} | {format(memories[form], '.0f') if form in memories else ''} |"
+        for form, note in rows.items()
+    ]
+
+
+def main() -> None:
+    """Measure, print and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    parser.add_argument("--repeats", type=int, default=20, help="updates of each form")
+    parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=SHAPES)
+    parser.add_argument("--compile", nargs="*", choices=SHAPES, default=("strokes",), help="shapes to compile as well")
+    parser.add_argument(
+        "--dmc-batch", type=int, default=8, help="sequences of 50 steps at DMC's shape; the paper has 50"
+    )
+    parser.add_argument("--output", type=Path, default=Path(__file__).with_suffix(".md"))
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    table = [
+        f"torch {torch.__version__} on {platform.machine()}, {options.threads} thread(s), "
+        f"median of {options.repeats} interleaved updates, DMC with {options.dmc_batch} sequences of 50 steps, "
+        f"load average {os.getloadavg()[0]:.1f}.",
+        "",
+        "| shape | form | ms per update | times gaussian's | flow is faster by | MiB that updates need |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    for shape in options.shapes:
+        table += measure(shape, options)
+    options.output.write_text("\n".join(table) + "\n")
+    print("\n".join(table))
+
+
+if __name__ == "__main__":
+    main()
