@@ -168,8 +168,8 @@ def _link(arms: list[_Arm], junctions: list[set[Pixel]]) -> dict[int, int]:
 
 def _bend(one: _Arm, other: _Arm) -> float:
     """The angle by which a pen turns that arrives on one arm and leaves on the other, 0 … π."""
-    turn = abs(_heading(one) - _heading(other))
-    return abs(math.pi - turn)
+    between = abs(_heading(one) - _heading(other))
+    return round(abs(math.pi - between), 9)  # equal angles are equal on every machine
 
 
 def _heading(arm: _Arm) -> float:

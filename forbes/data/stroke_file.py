@@ -130,22 +130,22 @@ def save_strokes(path: Path, splits: Mapping[str, StrokeArrays]) -> None:
     `numpy.savez_compressed` would stamp the members with the time of writing.
     """
     check_strokes(splits, path, "Nothing was written")
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for split, arrays in splits.items():
+            for name, array in arrays._asdict().items():
+                member = zipfile.ZipInfo(f"{split}_{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+                member.create_system = 3  # Unix, also where this runs on Windows
+                buffer = io.BytesIO()
+                np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
+                archive.writestr(member, buffer.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=9)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with zipfile.ZipFile(temporary, "w") as archive:
-            for split, arrays in splits.items():
-                for name, array in arrays._asdict().items():
-                    member = zipfile.ZipInfo(f"{split}_{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-                    member.create_system = 3  # Unix, also where this runs on Windows
-                    buffer = io.BytesIO()
-                    np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
-                    archive.writestr(member, buffer.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=9)
+        temporary.write_bytes(content.getvalue())
         temporary.replace(path)
     except OSError as error:
         raise ForbesError(f"{path}: cannot be written ({error.strerror}). Choose another place.") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def sha256_of_arrays(splits: Mapping[str, StrokeArrays]) -> dict[str, str]:

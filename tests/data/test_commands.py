@@ -1,0 +1,104 @@
+import hashlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from forbes.data import commands
+from forbes.data.stroke_file import load_strokes, save_strokes
+from forbes.data.strokes import bundled_path
+from forbes.errors import ForbesError
+
+
+@pytest.fixture
+def images(mnist_digits, tmp_path):
+    """A folder of IDX files with ten training and ten test digits."""
+    pictures, labels = mnist_digits
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for prefix in ("train", "t10k"):
+        header = np.array([0x803, *pictures.shape], ">u4").tobytes()
+        (folder / f"{prefix}-images-idx3-ubyte").write_bytes(header + pictures.tobytes())
+        (folder / f"{prefix}-labels-idx1-ubyte").write_bytes(np.array([0x801, 10], ">u4").tobytes() + labels.tobytes())
+    return folder
+
+
+def test_building_twice_gives_the_same_bytes(images, tmp_path, capsys):
+    output = tmp_path / "strokes.npz"
+
+    for change in ("new", "unchanged"):
+        commands.main(["build-strokes", "--images", str(images), "-o", str(output)])
+        digest = hashlib.sha256(output.read_bytes()).hexdigest()
+        assert f"sha256 {digest}, {change}" in capsys.readouterr().out
+
+    assert load_strokes(output, "")["test"].labels.tolist() == [7, 2, 1, 0, 4, 1, 4, 9, 5, 9]
+
+
+def test_show_draws_each_digit_as_a_row(tmp_path, capsys):
+    commands.main(["show", "strokes", "--index", "0", "3", "-o", str(tmp_path / "two.png")])
+    commands.main(["show", "strokes", "--index", "0", "-o", str(tmp_path / "one.png")])
+
+    two, one = (np.asarray(Image.open(tmp_path / name)) for name in ("two.png", "one.png"))
+    assert abs(two.shape[0] - 2 * one.shape[0]) <= 1  # in pixels
+    assert len(np.unique(two.reshape(-1, two.shape[-1]), axis=0)) > 20  # the colours of the order
+    assert capsys.readouterr().out.splitlines()[0] == str(tmp_path / "two.png")
+
+
+@pytest.mark.parametrize("index", ["10000", "-1"])
+def test_a_digit_outside_its_split_is_refused(tmp_path, index):
+    with pytest.raises(ForbesError, match=f"{index} is no digit of the split test, expected 0 to 9999"):
+        commands.main(["show", "strokes", f"--index={index}", "-o", str(tmp_path / "strokes.png")])
+
+
+@pytest.mark.parametrize("name", ["strokes.xyz", "absent/strokes.png"])
+def test_a_picture_that_cannot_be_written_is_named(tmp_path, name):
+    with pytest.raises(
+        ForbesError, match=rf"{name}: cannot be written \(.*\)\. Choose another place or end it in \.png"
+    ):
+        commands.main(["show", "strokes", "-o", str(tmp_path / name)])
+
+
+def test_fetch_stores_where_forbes_data_points(make_arrays, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FORBES_DATA", str(tmp_path / "store"))
+    splits = {split: make_arrays([[(1, 1)]]) for split in ("train", "test")}
+    save_strokes(tmp_path / "converted.npz", splits)
+    with pytest.raises(ForbesError, match=r'converted\.npz: array "train_points" has sha256'):
+        commands.main(["fetch", "strokes", "--from", str(tmp_path / "converted.npz")])
+
+    monkeypatch.setattr("forbes.data.fetch.verify_dejong", lambda *_: None)
+    commands.main(["fetch", "strokes", "--from", str(tmp_path / "converted.npz")])
+
+    assert load_strokes(tmp_path / "store" / "dejong-strokes.npz", "")["train"].points.tolist() == [[1, 1]]
+    assert f"{tmp_path / 'store' / 'dejong-strokes.npz'}: stored" in capsys.readouterr().out
+
+
+def test_fetch_does_not_trust_a_stored_file_that_is_not_the_papers(make_arrays, tmp_path, monkeypatch):
+    monkeypatch.setenv("FORBES_DATA", str(tmp_path))
+    save_strokes(tmp_path / "dejong-strokes.npz", {split: make_arrays([[(1, 1)]]) for split in ("train", "test")})
+
+    with pytest.raises(ForbesError, match=r'dejong-strokes\.npz: array "train_points" has sha256 .* Delete it'):
+        commands.main(["fetch", "strokes"])
+
+
+def test_a_set_compared_with_itself_is_the_same(capsys, make_arrays, tmp_path):
+    path = tmp_path / "strokes.npz"
+    save_strokes(path, {split: make_arrays([[(1, 1), (1, 2), (1, 3)]]) for split in ("train", "test")})
+
+    commands.main(["compare-strokes", str(path), str(path)])
+
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[-1] for line in lines[:3]] == ["1.000", "0.000", "1.000"]
+    assert lines[-1].split()[-3:] == ["1.000", "/", "1.000"]
+
+
+@pytest.mark.parametrize("command", [[], ["build-strokes"], ["fetch"], ["compare-strokes"], ["show"]])
+def test_help_has_an_example_of_every_command(command, capsys):
+    with pytest.raises(SystemExit) as ended:
+        commands.main([*command, "--help"])
+
+    assert ended.value.code == 0
+    assert f"forbes data {' '.join(command)}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_bundled_set_lies_beside_its_readme():
+    assert bundled_path().with_name("README.md").is_file()
