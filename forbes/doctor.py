@@ -5,6 +5,7 @@ import platform
 import shutil
 from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -18,7 +19,7 @@ from forbes.data.strokes import bundled_path
 
 __all__ = ["main"]
 
-REQUIRED = ("torch", "lightning", "jsonargparse", "torchmetrics", "numpy", "matplotlib", "pandas")
+REQUIRED = ("torch", "lightning", "jsonargparse", "numpy", "matplotlib", "pandas")
 OPTIONAL = {"scikit-image": "build", "tensorboard": "tracking", "dm-control": "dmc"}
 
 
@@ -74,6 +75,9 @@ def _hardware() -> Iterator[Finding]:
 
 
 def _data() -> Iterator[Finding]:
+    package = Path(forbes.__file__).parent
+    shipped = package / "configs" if (package / "configs").is_dir() else package.parent / "configs"
+    yield Finding("configurations", str(shipped))
     for name, path, remedy, needed in (
         ("strokes, bundled", bundled_path(), "forbes data build-strokes --images DIR", True),
         ("strokes, de Jong", dejong_path(), "forbes data fetch strokes (optional: the paper's set)", False),
