@@ -1,5 +1,6 @@
 """The flow belief of FORBES (Chen et al., 2022, arXiv 2205.11051, equations of §3.1)."""
 
+import torch
 from torch import Tensor
 
 from forbes.beliefs.base import BeliefHead, Sampler
@@ -31,7 +32,8 @@ class FlowBelief(BeliefHead):
     ) -> None:
         super().__init__(state_dim, context_dim)
         self.base = GaussianBelief(state_dim, context_dim, min_std)
-        self.flow = ConditionalFlow(state_dim, context_dim, layers, width)
+        with torch.random.fork_rng(devices=[]):  # the same seed gives a Gaussian belief the same other weights
+            self.flow = ConditionalFlow(state_dim, context_dim, layers, width)
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """See `BeliefHead.rsample`."""
