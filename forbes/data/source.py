@@ -24,7 +24,7 @@ class SequenceBatch(NamedTuple):
 
 
 class SequenceSource(ABC):
-    """A set of sequences. To add one, copy `strokes.py`: three methods and two numbers.
+    """A set of sequences. To add one, copy `strokes.py`: four methods and two numbers.
 
     `gather` runs on the CPU and returns the most compact tensors that determine the batch (a NamedTuple of tensors);
     `decode` turns them into a `SequenceBatch` on whatever device they have been moved to.
@@ -34,6 +34,10 @@ class SequenceSource(ABC):
     """Shape of one observation, without batch and time."""
     action_dim: int
     """A, 0 for a process without actions."""
+
+    @abstractmethod
+    def sha256(self) -> str:
+        """Hash what all the sequences are made of, for the record of a run."""
 
     @abstractmethod
     def size(self, split: Split) -> int:

@@ -1,5 +1,6 @@
 """Sequential MNIST: a digit appears as a pen writes it, frame t showing the first t points of its path."""
 
+import hashlib
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from forbes.data.dejong import dejong_path, verify_dejong
 from forbes.data.source import SequenceBatch, SequenceSource, Split
-from forbes.data.stroke_file import SIDE, StrokeArrays, load_strokes
+from forbes.data.stroke_file import SIDE, StrokeArrays, load_strokes, sha256_of_arrays
 from forbes.errors import ForbesError
 
 __all__ = ["StrokePoints", "Strokes", "bundled_path"]
@@ -92,6 +93,11 @@ class Strokes(SequenceSource):
             split: (torch.from_numpy(arrays.points), torch.from_numpy(arrays.offsets).long())
             for split, arrays in self._splits.items()
         }
+
+    def sha256(self) -> str:
+        """Hash the arrays of all splits."""
+        hashes = sha256_of_arrays({name: arrays for name, arrays in self._splits.items()})
+        return hashlib.sha256(" ".join(hashes.values()).encode()).hexdigest()
 
     def size(self, split: Split) -> int:
         """Count the digits of a split."""

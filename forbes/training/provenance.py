@@ -102,9 +102,8 @@ def _describe(arguments: Sequence[str]) -> dict[str, Any]:
 
 
 def _describe_data(trainer: Trainer) -> dict[str, Any]:
-    """Give the hash of the data, where the source knows one."""
-    sha256 = getattr(trainer.datamodule.source, "sha256", None)  # type: ignore[attr-defined]
-    return {"data_sha256": sha256() if sha256 else None}
+    """Give the hash of the data."""
+    return {"data_sha256": trainer.datamodule.source.sha256()}  # type: ignore[attr-defined]
 
 
 def commit() -> str | None:

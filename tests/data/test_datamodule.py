@@ -22,6 +22,9 @@ class Numbers(SequenceSource):
     observation_shape = (1, 2, 2)
     action_dim = 3
 
+    def sha256(self):
+        return "0" * 64
+
     def size(self, split):
         return {"train": 23, "validation": 7, "test": 10}[split]
 
