@@ -50,11 +50,11 @@ model:
 data:
   class_path: SequenceDataModule
   init_args:
-    source: {{class_path: Strokes, init_args: {{path: {strokes_file}, validation: 8}}}}
+    source: {{class_path: Strokes, init_args: {{path: {strokes_file}, validation: 20}}}}
     batch_size: 4
     length: 6
     updates_per_epoch: 5
-    validation_sequences: 8
+    validation_sequences: 20
 trainer:
   accelerator: cpu
   max_epochs: 2
