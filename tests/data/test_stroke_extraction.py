@@ -169,8 +169,12 @@ def test_a_four_is_an_angle_and_then_a_stem():
 
 @pytest.mark.parametrize(
     ("line", "start"),
-    [([(3, 9 - i) for i in range(9)], (3, 1)), ([(9 - i, 4) for i in range(9)], (1, 4))],
-    ids=["downwards", "to the right"],
+    [
+        ([(3, 9 - i) for i in range(9)], (3, 1)),
+        ([(9 - i, 4) for i in range(9)], (1, 4)),
+        ([(i, 8 - 7 * i // 10) for i in range(11)], (10, 1)),
+    ],
+    ids=["downwards", "to the right", "a slash downwards"],
 )
 def test_a_line_is_written(line, start):
     image = np.zeros((12, 12), bool)
