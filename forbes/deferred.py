@@ -1,4 +1,4 @@
-r"""Affine maps for a time loop whose weight gradients are computed once, after the loop.
+r"""A time loop whose weight gradients are computed once, after the loop.
 
 Backpropagating :math:`y_t = W x_t + b` through T steps costs T small products :math:`g_t x_t^\top` and T additions
 into the same matrix. Here the steps see a detached W, and each adds its own slice of b repeated over time. The
@@ -15,32 +15,31 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import linear
 
-__all__ = ["Affine", "Bind", "bind_now", "deferred"]
+__all__ = ["Affine", "Bind", "Loop"]
 
 Affine: TypeAlias = Callable[[Tensor], Tensor]
-"""x `(B, in)` to W x + b `(B, out)`."""
+"""x `(*, in)` to W x + b `(*, out)`."""
 Bind: TypeAlias = Callable[[Tensor, Tensor], Affine]
-"""Fixes W `(out, in)` and b, `(out,)` or one per step `(T, B, out)`, for a loop."""
+"""Fixes W `(out, in)` and b `(out,)`."""
 
 
-def bind_now(weight: Tensor, bias: Tensor) -> Affine:
-    """Bind without a loop: plain `linear`, for a bias that does not change with time."""
-    return lambda x: linear(x, weight, bias)
+class Loop:
+    """A loop over `steps` steps of `(batch, in)` inputs, to which affine maps are bound."""
 
+    def __init__(self, steps: int, batch: int) -> None:
+        self.steps, self.batch = steps, batch
 
-def deferred(steps: int, batch: int) -> Bind:
-    """Give the `Bind` of a loop over `steps` steps of `(batch, in)` inputs; each affine map is called once a step."""
-
-    def bind(weight: Tensor, bias: Tensor) -> Affine:
+    def affine(self, weight: Tensor, bias: Tensor) -> Affine:
+        """Bind W `(out, in)` and b, `(out,)` or one per step `(T, B, out)`, to a map that is called once a step."""
+        shares = bias.expand(self.steps, self.batch, -1)  # (T, B, out)
+        if not torch.is_grad_enabled() or torch.compiler.is_compiling():
+            # Nothing to defer, or the compiler orders the products itself.
+            share = iter(shares.unbind(0))
+            return lambda x: torch.addmm(next(share), x, weight.T)
         inputs: list[Tensor] = []
-        if torch.is_grad_enabled() and not torch.compiler.is_compiling():
-            shares = _Deferred.apply(weight, bias.expand(steps, batch, -1), inputs)  # type: ignore[no-untyped-call]
-            matrix = weight.detach().T  # (in, out)
-        else:  # nothing to defer, or the compiler orders the products itself
-            shares, matrix = bias.expand(steps, batch, -1), weight.T  # (T, B, out), (in, out)
-        share = iter(shares.unbind(0))
+        share = iter(_Shares.apply(weight, shares, inputs).unbind(0))  # type: ignore[no-untyped-call]
+        matrix = weight.detach().T  # (in, out)
 
         def affine(x: Tensor) -> Tensor:
             inputs.append(x.detach())
@@ -48,11 +47,9 @@ def deferred(steps: int, batch: int) -> Bind:
 
         return affine
 
-    return bind
 
-
-class _Deferred(torch.autograd.Function):
-    """Identity on the shares; in the backward pass, adds the gradient of the weight the steps did not compute."""
+class _Shares(torch.autograd.Function):
+    """Identity on b repeated over time; in the backward pass, forms the gradient that the steps left out."""
 
     @staticmethod
     def forward(ctx: Any, weight: Tensor, shares: Tensor, inputs: list[Tensor]) -> Tensor:
@@ -62,5 +59,4 @@ class _Deferred(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        x = torch.stack(ctx.inputs).flatten(0, 1)  # (T B, in)
-        return grad.flatten(0, 1).T @ x, grad, None  # (out, in), (T, B, out)
+        return grad.flatten(0, 1).T @ torch.cat(ctx.inputs), grad, None  # (out, in), (T, B, out)

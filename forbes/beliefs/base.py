@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 from torch import Tensor, nn
 
-from forbes.deferred import Bind
+from forbes.deferred import Loop
 
 __all__ = ["BeliefFamily", "BeliefHead", "Sampler"]
 
@@ -45,10 +45,10 @@ class BeliefHead(nn.Module, ABC):
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
         """Give log p(s | c) in nats, summed over the state: shapes `(*, D)` and `(*, C)` to `(*)`, which broadcast."""
 
-    def sampler(self, bind: Bind) -> Sampler:
+    def sampler(self, loop: Loop) -> Sampler:
         """Prepare `rsample` for a time loop: what does not depend on the context is computed once, here.
 
-        A family may pass its weights through `bind` (see `forbes.deferred`); the default does not.
+        A family may bind its weights to the loop (see `forbes.deferred`); the default does not.
         """
         return self.rsample
 

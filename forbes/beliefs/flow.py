@@ -6,7 +6,7 @@ from torch import Tensor
 from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.beliefs.flows import ConditionalFlow
 from forbes.beliefs.gaussian import GaussianBelief
-from forbes.deferred import Bind
+from forbes.deferred import Loop
 
 __all__ = ["FlowBelief"]
 
@@ -46,9 +46,9 @@ class FlowBelief(BeliefHead):
         base, log_det = self.flow.inverse(state, context)
         return self.base.log_prob(base, context) - log_det
 
-    def sampler(self, bind: Bind) -> Sampler:
+    def sampler(self, loop: Loop) -> Sampler:
         """See `BeliefHead.sampler`."""
-        base, generate = self.base.sampler(bind), self.flow.generator(bind)
+        base, generate = self.base.sampler(loop), self.flow.generator(loop.affine)
 
         def sample(context: Tensor) -> tuple[Tensor, Tensor]:
             noise, log_prob = base(context)

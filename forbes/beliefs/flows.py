@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, pad, softplus
 
-from forbes.deferred import Bind, bind_now
+from forbes.deferred import Affine, Bind
 from forbes.errors import ForbesError
 
 __all__ = ["AffineCoupling", "ConditionalFlow", "FlowMap", "LULinear"]
@@ -131,7 +131,7 @@ class ConditionalFlow(nn.Module):
         self.couplings = nn.ModuleList(AffineCoupling(dim, width, swap=bool(k % 2)) for k in range(layers))
         self.mixings = nn.ModuleList(LULinear(dim) for _ in range(layers - 1))
 
-    def generator(self, bind: Bind = bind_now) -> FlowMap:
+    def generator(self, bind: Bind) -> FlowMap:
         """Prepare (x, c) -> y = f(x; c), `(*, D)`, and log|det ∂y/∂x| in nats, `(*)`.
 
         What no context changes is computed here, once.
@@ -155,7 +155,7 @@ class ConditionalFlow(nn.Module):
 
     def forward(self, x: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
         """Generate: y = f(x; c), shape `(*, D)`, and log|det ∂y/∂x| in nats, shape `(*)`."""
-        return self.generator()(x, context)
+        return self.generator(_bind_now)(x, context)
 
     def inverse(self, y: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
         """Evaluate: x = f⁻¹(y; c), shape `(*, D)`, and the forward log|det ∂y/∂x| at it in nats, shape `(*)`."""
@@ -163,7 +163,7 @@ class ConditionalFlow(nn.Module):
         shares = self.context(context).chunk(len(couplings), -1)  # K x (*, W)
         log_scales = []
         for k in reversed(range(len(couplings))):
-            half, shift = couplings[k].network(bind_now)(y, shares[k])
+            half, shift = couplings[k].network(_bind_now)(y, shares[k])
             log_scales.append(LOG_SCALE_BOUND * half)
             y = (y - shift) * (-log_scales[-1]).exp()
             if k > 0:
@@ -179,3 +179,8 @@ class ConditionalFlow(nn.Module):
     def _constant_log_det(self) -> Tensor:
         """Sum the LU layers' log-determinants, a scalar."""
         return sum((layer.log_det() for layer in self._layers()[1]), start=self.context.bias.new_zeros(()))
+
+
+def _bind_now(weight: Tensor, bias: Tensor) -> Affine:
+    """Bind outside a time loop."""
+    return lambda x: linear(x, weight, bias)

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.base import BeliefHead, Sampler
-from forbes.deferred import Bind
+from forbes.deferred import Loop
 
 __all__ = ["GaussianBelief", "standard_normal_log_prob"]
 
@@ -41,9 +41,9 @@ class GaussianBelief(BeliefHead):
         """See `BeliefHead.rsample`."""
         return _draw(*self.moments(context), sample_shape)
 
-    def sampler(self, bind: Bind) -> Sampler:
+    def sampler(self, loop: Loop) -> Sampler:
         """See `BeliefHead.sampler`."""
-        parameters_of = bind(self.parameters_of.weight, self.parameters_of.bias)
+        parameters_of = loop.affine(self.parameters_of.weight, self.parameters_of.bias)
         return lambda context: _draw(*self._moments(parameters_of(context)))
 
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from typing import ClassVar, TypeAlias
 import torch
 from torch import Tensor, nn
 
-from forbes.deferred import Bind
+from forbes.deferred import Loop
 from forbes.errors import ForbesError
 
 __all__ = ["ConvDecoder", "ConvEncoder", "Decoder", "Encoder", "MLPDecoder", "MLPEncoder", "bind_gru", "perceptron"]
@@ -21,13 +21,13 @@ def perceptron(input_dim: int, width: int, layers: int) -> nn.Sequential:
     return nn.Sequential(*blocks)
 
 
-def bind_gru(cell: nn.GRUCell, bind: Bind) -> Callable[[Tensor, Tensor], Tensor]:
+def bind_gru(cell: nn.GRUCell, loop: Loop) -> Callable[[Tensor, Tensor], Tensor]:
     r"""Bind a GRU cell to a loop: (x, h) to the next h, `(B, H)`; the same numbers as `cell(x, h)`.
 
     .. math:: r, z = \sigma(W_{ir} x + W_{hr} h), \sigma(W_{iz} x + W_{hz} h), \quad
               n = \tanh(W_{in} x + r \odot W_{hn} h), \quad h' = n + z \odot (h - n)
     """
-    of_input, of_hidden = bind(cell.weight_ih, cell.bias_ih), bind(cell.weight_hh, cell.bias_hh)
+    of_input, of_hidden = loop.affine(cell.weight_ih, cell.bias_ih), loop.affine(cell.weight_hh, cell.bias_hh)
     sizes = [2 * cell.hidden_size, cell.hidden_size]
 
     def step(x: Tensor, hidden: Tensor) -> Tensor:

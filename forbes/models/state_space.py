@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from forbes.beliefs import BeliefFamily, BeliefHead
-from forbes.deferred import Affine, Bind, bind_now, deferred
+from forbes.deferred import Affine, Loop
 from forbes.models.elbo import ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, bind_gru, perceptron
@@ -132,11 +132,11 @@ class StateSpaceModel(nn.Module):
         """
         batch, time = embedding.shape[:2]
         hidden, state = start or self.initial(batch)
-        bind = deferred(time, batch)
-        transition = self._bind(self.transition, action, bind)
-        posterior_context = self._bind(self.posterior_context, embedding, bind)
-        gru = bind_gru(self.gru, bind)
-        sample = self.posterior.sampler(bind)
+        loop = Loop(time, batch)
+        transition = self._bind(self.transition, action, loop)
+        posterior_context = self._bind(self.posterior_context, embedding, loop)
+        gru = bind_gru(self.gru, loop)
+        sample = self.posterior.sampler(loop)
 
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         for _ in range(time):
@@ -161,7 +161,7 @@ class StateSpaceModel(nn.Module):
             T steps after `start`, which itself is not among them.
         """
         hidden, state = start
-        sample = self.prior.sampler(bind_now)
+        sample = self.prior.sampler(Loop(action.shape[1], len(action)))
         steps: list[tuple[Tensor, Tensor, Tensor]] = []
         for step_action in action.unbind(1):
             hidden = self.gru(self.transition(torch.cat((state, step_action), -1)), hidden)
@@ -195,19 +195,19 @@ class StateSpaceModel(nn.Module):
         )
 
     @staticmethod
-    def _bind(network: nn.Sequential, known: Tensor, bind: Bind) -> Affine:
+    def _bind(network: nn.Sequential, known: Tensor, loop: Loop) -> Affine:
         """Bind a perceptron of [x, known] to a loop over x; the share of what is known is one matmul over all steps.
 
         Args:
             network: a `perceptron`.
             known: the inputs that do not depend on the recurrence, `(B, T, K)`.
-            bind: of the loop.
+            loop: to bind it to.
         """
         first, *others = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
         cut = first.in_features - known.shape[-1]
         of_loop, of_known = first.weight[:, :cut], first.weight[:, cut:]  # (M, cut), (M, K)
-        layers = [bind(of_loop, linear(known.transpose(0, 1), of_known, first.bias))]  # share (T, B, M)
-        layers += [bind(layer.weight, layer.bias) for layer in others]
+        layers = [loop.affine(of_loop, linear(known.transpose(0, 1), of_known, first.bias))]  # share (T, B, M)
+        layers += [loop.affine(layer.weight, layer.bias) for layer in others]
 
         def run(x: Tensor) -> Tensor:
             for layer in layers:
