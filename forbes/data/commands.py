@@ -145,13 +145,19 @@ def main(argv: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="forbes data", description="Build, fetch, compare and look at the data.")
+    parser = argparse.ArgumentParser(
+        prog="forbes data",
+        description="Build, fetch, compare and look at the data.",
+        epilog="examples:",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def add(name: str, function: Callable[..., None], example: str) -> argparse.ArgumentParser:
         summary = (function.__doc__ or "").partition("\n")[0]
         command = commands.add_parser(name, help=summary, description=summary, epilog=f"example: forbes data {example}")
         command.set_defaults(command=function)
+        parser.epilog = f"{parser.epilog}\n  forbes data {example}"
         return command
 
     build = add("build-strokes", build_strokes, "build-strokes --images package/data")

@@ -205,7 +205,7 @@ def test_a_digit_of_specks_alone_is_kept():
     assert trace(image) == [[(4, 4)], [(9, 4)]]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100)
 @given(arrays(bool, (7, 7), elements=st.booleans()).filter(np.any))
 def test_any_thinned_scribble_is_traced_as_a_pen_could_draw_it(scribble):
     line = thin(np.kron(np.pad(scribble, 1), np.ones((3, 3), bool)).astype(np.uint8) * 255)
