@@ -20,17 +20,17 @@ FLOWS = {
 }
 
 
-def randomised(module, seed=0, scale=0.5):
+def randomised(module, scale=0.5):
     """Move every weight of a module in float64 away from where it starts, so that nothing is zero or the identity."""
-    generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in module.double().parameters():
-            parameter += scale * torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+            parameter += scale * torch.randn_like(parameter)
     return module
 
 
-def random_flow(dim=4, layers=3, width=8, seed=0):
-    return randomised(ConditionalFlow(dim, CONTEXT, layers, width), seed)
+def random_flow(dim=4, layers=3, width=8, seed=0, scale=0.5):
+    torch.manual_seed(seed)
+    return randomised(ConditionalFlow(dim, CONTEXT, layers, width), scale)
 
 
 def normal(*shape, seed=0):
@@ -94,7 +94,7 @@ def test_one_context_serves_many_points():
 
 
 def test_a_coupling_keeps_one_part_and_scales_the_other_by_at_most_e_squared():
-    flow = randomised(ConditionalFlow(5, CONTEXT, layers=1, width=8), scale=100.0)
+    flow = random_flow(dim=5, layers=1, scale=100.0)
     x, context = normal(1000, 5), normal(1000, CONTEXT, seed=1)
     step = torch.tensor([0.0, 0, 1, 1, 1], dtype=torch.float64)  # along the part that is transformed
 
@@ -107,6 +107,7 @@ def test_a_coupling_keeps_one_part_and_scales_the_other_by_at_most_e_squared():
 
 
 def test_lu_linear_has_the_determinant_and_the_inverse_of_its_matrix():
+    torch.manual_seed(0)
     mixing = randomised(LULinear(6))
 
     torch.testing.assert_close(mixing.log_det(), torch.linalg.slogdet(mixing.matrix()).logabsdet)
@@ -155,7 +156,7 @@ def as_zuko(transforms, flow, context):
 
 @pytest.mark.parametrize(("dim", "layers"), [(2, 3), (5, 4), (30, 5)])
 def test_agrees_with_zuko_given_equal_weights(zuko, dim, layers):
-    flow = randomised(ConditionalFlow(dim, CONTEXT, layers, width=16), scale=0.2)
+    flow = random_flow(dim, layers, width=16, scale=0.2)
     x, context = normal(6, dim), normal(6, CONTEXT, seed=1)
 
     y, log_det = flow(x, context)

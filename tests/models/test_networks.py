@@ -4,10 +4,9 @@ import pytest
 import torch
 from torch import nn
 
-from forbes.deferred import bind_now
 from forbes.errors import ForbesError
 from forbes.models import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
-from forbes.models.networks import bind_gru, perceptron
+from forbes.models.networks import perceptron
 
 
 @pytest.mark.parametrize(("shape", "embedding_dim"), [((3, 64, 64), 1024), ((1, 28, 28), 128)])
@@ -59,11 +58,3 @@ def test_perceptron_ends_with_a_relu():
 
     assert output.shape == (100, 5)
     assert output.min() == 0
-
-
-def test_bound_gru_computes_what_the_cell_computes():
-    torch.manual_seed(0)
-    cell = nn.GRUCell(4, 6).double()
-    x, hidden = torch.randn(5, 4, dtype=torch.float64), torch.randn(5, 6, dtype=torch.float64)
-
-    torch.testing.assert_close(bind_gru(cell, bind_now)(x, hidden), cell(x, hidden))

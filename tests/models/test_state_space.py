@@ -208,6 +208,49 @@ def test_gradients_of_an_untrained_model_reach_every_parameter_at_the_second_upd
     assert [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()] == []
 
 
+def test_a_second_backward_pass_gives_the_same_gradients(family):
+    """Also after a pass that wants the gradients of the actions only, and one of the first steps only."""
+    model, (observation, action, mask) = random_model(family), sequences()
+    action.requires_grad_()
+    terms, parameters = model.elbo(observation, action, mask), list(model.parameters())
+    loss = terms.elbo.sum()
+
+    expected = torch.autograd.grad(loss, parameters, retain_graph=True)
+    torch.autograd.grad(loss, action, retain_graph=True)
+    torch.autograd.grad(terms.kl[:, :2].sum(), parameters, retain_graph=True, allow_unused=True)
+    again = torch.autograd.grad(loss, parameters)
+
+    torch.testing.assert_close(again, expected)
+
+
+def test_gradients_of_some_steps_are_those_of_the_plain_loop(family, same_noise):
+    model, (observation, action, mask) = random_model(family), sequences()
+
+    gradients, expected = (
+        torch.autograd.grad(kl[:, 2].sum(), list(model.parameters()), allow_unused=True)
+        for kl in (model.elbo(observation, action, mask).kl, step_by_step(model, observation, action)[1])
+    )
+
+    torch.testing.assert_close(gradients, expected)
+
+
+def test_a_frozen_model_passes_gradients_to_the_actions(family, same_noise):
+    """What an actor learns from: imagination and filter, the world model fixed while the graph is built."""
+    model, (observation, action, _) = random_model(family), sequences()
+    action.requires_grad_()
+
+    def gradient():
+        filtered = model.filter(model.embed(observation), action)
+        rollout = model.imagine(filtered.at(-1), action)
+        return torch.autograd.grad(rollout.features.sum() + rollout.log_prob.sum(), action)[0]
+
+    expected = gradient()
+    model.requires_grad_(False)
+
+    torch.testing.assert_close(gradient(), expected)
+    assert expected.ne(0).any(-1).all()
+
+
 def test_padding_changes_neither_loss_nor_gradients(family):
     model, (observation, action, mask) = random_model(family), sequences()
     mask[0, 2:] = mask[3, 5:] = False
