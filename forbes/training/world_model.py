@@ -40,6 +40,7 @@ class WorldModel(LightningModule):
         kl_warmup: updates over which the weight of the KL rises from 0 to 1.
         learning_rate: of Adam (eps 1e-7).
         schedule: "constant", or "cosine" to 0 at the end of the training.
+        warmup: updates over which the learning rate rises from 0; a high rate needs it.
         clip_norm: gradients are scaled down to this norm.
         seed: of the noise of training and validation.
     """
@@ -62,6 +63,7 @@ class WorldModel(LightningModule):
         kl_warmup: int = 0,
         learning_rate: float = 5e-4,
         schedule: Literal["constant", "cosine"] = "constant",
+        warmup: int = 0,
         clip_norm: float = 100.0,
         seed: int = 0,
     ) -> None:
@@ -78,7 +80,8 @@ class WorldModel(LightningModule):
             mlp_layers,
         )
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
-        self.learning_rate, self.schedule, self.clip_norm, self.seed = learning_rate, schedule, clip_norm, seed
+        self.learning_rate, self.schedule, self.warmup = learning_rate, schedule, warmup
+        self.clip_norm, self.seed = clip_norm, seed
 
     def terms(self, batch: SequenceBatch) -> ElboTerms:
         """Estimate the parts of the bound on a batch."""
@@ -116,11 +119,16 @@ class WorldModel(LightningModule):
     def configure_optimizers(self) -> Any:
         """Adam with the paper's rate; fused, since a step over many small tensors is bound by calls."""
         optimizer = Adam(self.parameters(), lr=self.learning_rate, eps=1e-7, fused=True)
-        if self.schedule == "constant":
-            return optimizer
-        total = self.trainer.estimated_stepping_batches
-        scheduler = LambdaLR(optimizer, lambda update: 0.5 * (1 + math.cos(math.pi * min(1.0, update / total))))
+        scheduler = LambdaLR(optimizer, self._rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def _rate(self, update: int) -> float:
+        """Give the learning rate of an update as a share of `learning_rate`."""
+        rise = min(1.0, (update + 1) / self.warmup) if self.warmup else 1.0
+        if self.schedule == "constant":
+            return rise
+        done = min(1.0, update / self.trainer.estimated_stepping_batches)
+        return rise * 0.5 * (1 + math.cos(math.pi * done))
 
     def configure_gradient_clipping(
         self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
