@@ -24,7 +24,7 @@ runs/compare/%/fitted: .venv/installed
 	touch $@
 
 test: .venv/installed-dev
-	$(BIN)/pytest -q -n 2
+	$(BIN)/pytest -q
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -1,4 +1,4 @@
-"""What several tests need: one thread a process, and a few digits that nobody has to read from the disk."""
+"""What several tests need: one thread, and a few digits that nobody has to read from the disk."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import torch
 from forbes.cli import main
 from forbes.data.stroke_file import StrokeArrays, save_strokes
 
-torch.set_num_threads(1)  # two test processes share two processors
+torch.set_num_threads(1)  # a second thread gains nothing on matrices of this size
 
 
 @pytest.fixture(scope="session")
