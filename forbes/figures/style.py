@@ -70,8 +70,8 @@ def density_map(colour: str) -> LinearSegmentedColormap:
 
 
 def show_settled(axes: Axes, curves: Sequence[pd.Series]) -> None:
-    """Choose the height of an axis of curves over updates: their first tenth, which comes from afar, may leave it."""
-    first = 0.1 * max(curve.index.max() for curve in curves)
+    """Choose the height of an axis of curves over updates: their first quarter, which comes from afar, may leave it."""
+    first = 0.25 * max(curve.index.max() for curve in curves)
     settled = [value for curve in curves for value in curve[curve.index >= first]]
     margin = 0.05 * (max(settled) - min(settled)) + 1e-6
     axes.set_ylim(min(settled) - margin, max(settled) + margin)

@@ -14,7 +14,7 @@ from forbes.beliefs import BeliefHead
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import first_of_each_class
-from forbes.figures.style import BLACK, BLUE, ORANGE, PAGE, density_map, paper_style
+from forbes.figures.style import BLACK, BLUE, GREY, ORANGE, PAGE, density_map, paper_style
 from forbes.training.callbacks.picture import PictureCallback, to_device
 from forbes.training.world_model import WorldModel
 
@@ -99,6 +99,8 @@ def _draw_beliefs(above: Axes, below: Axes, prior: _Cloud, posterior: _Cloud, na
     if named:
         above.set_ylabel(f"prior, {kind}", color=ORANGE)
         below.set_ylabel(f"posterior, {kind}", color=BLUE)
+        for axes in (above, below):
+            axes.yaxis.set_label_coords(-0.3, 0.5)
 
 
 def _draw_cloud(axes: Axes, cloud: _Cloud, colour: str, shown: Tensor) -> None:
@@ -121,7 +123,9 @@ def _draw_cloud(axes: Axes, cloud: _Cloud, colour: str, shown: Tensor) -> None:
 def _draw_frame(axes: Axes, observation: Tensor, title: str) -> None:
     axes.imshow(observation.float().mean(0).cpu().numpy(), cmap="gray_r", vmin=0)
     axes.set_title(title, pad=2)
-    axes.set_axis_off()
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set(visible=True, color=GREY, linewidth=0.4)
+    axes.grid(False)
 
 
 def _principal_plane(prior: Tensor, posterior: Tensor) -> tuple[_Cloud, _Cloud, str]:
