@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from jsonargparse import DefaultHelpFormatter
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import CheckpointIO
 from lightning.fabric.utilities.exceptions import MisconfigurationException
@@ -90,6 +91,10 @@ def _run(command: str, arguments: Sequence[str]) -> int:
             raise
 
 
+class _Help(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter):
+    """Keeps the line breaks of the run folder's options."""
+
+
 class _Experiment(LightningCLI):
     """A command with its model, data and trainer.
 
@@ -115,6 +120,8 @@ class _Experiment(LightningCLI):
             trainer_defaults={"devices": 1, "enable_model_summary": False},
             parser_kwargs={
                 "prog": f"forbes {self.command}",
+                "usage": f"forbes {self.command} --config FILE [--OPTION VALUE ...]",
+                "formatter_class": _Help,
                 "description": DESCRIPTION[self.command],
                 "epilog": options.format_help() if self.command == "fit" else None,
                 "exit_on_error": False,

@@ -1,7 +1,6 @@
 """Run folders: everything that one training leaves, in one place that no two processes share."""
 
 import fcntl
-import itertools
 import json
 import os
 import platform
@@ -46,15 +45,16 @@ class RunFolder:
     @classmethod
     def new(cls, experiment: str, started: str, seed: int) -> "RunFolder":
         """Make a folder of its own for a run of an experiment that starts now."""
-        parent = Path("runs") / experiment
-        for number in itertools.count(1):
-            path = parent / (f"{started}-{seed}" if number == 1 else f"{started}-{seed}-{number}")
+        first = path = Path("runs") / experiment / f"{started}-{seed}"
+        number = 1
+        while True:
             try:
                 path.mkdir(parents=True)
-            except FileExistsError:
-                continue
-            return cls(path)
-        raise AssertionError("itertools.count ends")
+            except FileExistsError:  # another started in the same second
+                number += 1
+                path = first.with_name(f"{first.name}-{number}")
+            else:
+                return cls(path)
 
     @classmethod
     def trained(cls, path: Path | str) -> "RunFolder":
