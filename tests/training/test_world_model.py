@@ -67,17 +67,24 @@ class Batches(LightningDataModule):
     test_dataloader = predict_dataloader = val_dataloader
 
 
+def rate(trainer):
+    [group] = trainer.optimizers[0].param_groups
+    return group["lr"]
+
+
 class Recorder(Callback):
-    """What each update logged, its loss, learning rate and norm of the gradients it used."""
+    """What each update logged, its loss, and the learning rate and the norm of the gradients it used."""
 
     def __init__(self):
-        self.rows = []
+        self.rows, self.rates = [], []
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        self.rates.append(rate(trainer))
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
         metrics = {name: value.item() for name, value in trainer.callback_metrics.items()}
         norm = torch.stack([p.grad.norm() for p in pl_module.parameters() if p.grad is not None]).norm()
-        [group] = trainer.optimizers[0].param_groups
-        self.rows.append({**metrics, "loss": outputs["loss"].item(), "rate": group["lr"], "used_norm": norm.item()})
+        self.rows.append({**metrics, "loss": outputs["loss"].item(), "used_norm": norm.item()})
 
 
 def fit(model, updates=3):
@@ -198,12 +205,22 @@ def test_adam_has_the_papers_settings_and_every_parameter():
     assert {id(p) for p in group["params"]} == {id(p) for p in model.parameters()}
 
 
-def test_the_cosine_schedule_ends_at_zero_after_the_last_update():
-    _, recorder = fit(make_world_model(schedule="cosine", learning_rate=1.0), updates=4)
+@pytest.mark.parametrize(
+    ("options", "rates"),
+    [
+        ({}, [1, 1, 1, 1]),
+        ({"warmup": 3}, [1 / 3, 2 / 3, 1, 1]),
+        ({"schedule": "cosine"}, [0.5 * (1 + math.cos(math.pi * update / 4)) for update in range(4)]),
+        ({"schedule": "cosine", "warmup": 2}, [0.5, *(0.5 * (1 + math.cos(math.pi * u / 4)) for u in (1, 2, 3))]),
+    ],
+    ids=["constant", "warm-up", "cosine", "both"],
+)
+def test_each_update_has_the_learning_rate_of_the_schedule(options, rates):
+    trainer, recorder = fit(make_world_model(learning_rate=0.01, **options), updates=4)
 
-    after_update = [0.5 * (1 + math.cos(math.pi * update / 4)) for update in (1, 2, 3, 4)]
-
-    assert [row["rate"] for row in recorder.rows] == pytest.approx(after_update)
+    assert recorder.rates == pytest.approx([0.01 * share for share in rates])
+    if "schedule" in options:
+        assert rate(trainer) == 0  # after the last update
 
 
 def test_an_update_changes_every_parameter_sooner_or_later():
