@@ -24,7 +24,7 @@ def test_starts_as_the_gaussian_belief():
 
 
 def test_can_have_two_modes():
-    """Fitted to N(±2, 0.3²) it leaves the middle almost empty; the Gaussian of that spread has 0.27 of its mass there."""
+    """Fitted to N(±2, 0.3²) it leaves the middle empty; the Gaussian of that spread has 0.27 of its mass there."""
     torch.manual_seed(0)
     belief, context = FlowBelief(2, 1, layers=3, width=16), torch.ones(1)
     optimizer = torch.optim.Adam(belief.parameters(), lr=1e-2)
