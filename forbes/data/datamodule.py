@@ -23,7 +23,8 @@ class _Batches(IterableDataset[Any]):
         self.source, self.split, self.length, self.indices = source, split, length, indices
 
     def __iter__(self) -> Iterator[Any]:
-        return (self.source.gather(self.split, index, self.length) for index in self.indices)
+        for index in self.indices:  # lazily: when the iterator is made, the trainer may not know its update yet
+            yield self.source.gather(self.split, index, self.length)
 
     def __len__(self) -> int:
         return len(self.indices)

@@ -40,15 +40,7 @@ def test_two_epochs_and_two_more_are_four_epochs(straight, tiny_run, tmp_path):
     assert_same_run(run, straight)
 
 
-@pytest.mark.parametrize(
-    "schedule",
-    [
-        "constant",
-        pytest.param(
-            "cosine", marks=pytest.mark.xfail(strict=True, reason="the loader is made before the update is known")
-        ),
-    ],
-)
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
 def test_updates_after_the_last_checkpoint_are_made_again(tiny_config, tmp_path, monkeypatch, schedule):
     """What SIGKILL leaves: metrics that are ahead of the checkpoint."""
     fit = ["fit", "--config", str(tiny_config), *FOUR_EPOCHS, "--model.schedule", schedule, "--run_dir"]
