@@ -69,7 +69,10 @@ def main(argv: Sequence[str]) -> None:
     pairs = _pair(evaluations)
     for evaluation in evaluations:
         write_record(evaluation.run.path, evaluation.split, evaluation.entry, evaluation.bound)
-    _print(evaluations, pairs)
+    console = Console(width=None if sys.stdout.isatty() else 160)  # into a file, rich would fold at 80
+    _print_runs(evaluations, console)
+    if pairs:
+        _print_pairs(pairs, console)
 
 
 def _parser() -> ArgumentParser:
@@ -93,11 +96,8 @@ def _device(name: str) -> str:
     chosen = ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
     try:
         torch.zeros(1, dtype=torch.float64, device=chosen)
-    except (
-        RuntimeError,
-        AssertionError,
-        TypeError,
-    ) as error:  # a torch without CUDA asserts; float64 is unknown to MPS
+    # What torch raises for a name it does not know, without CUDA, and where there is no float64.
+    except (RuntimeError, AssertionError, TypeError) as error:
         reason = str(error).splitlines()[0]
         raise ForbesError(f"--device {name}: it cannot be used ({reason}). Choose cpu, or auto") from error
     return chosen
@@ -171,11 +171,7 @@ def _pair(evaluations: Sequence[_Evaluation]) -> list[tuple[_Evaluation, _Evalua
     return pairs
 
 
-def _print(evaluations: Sequence[_Evaluation], pairs: Sequence[tuple[_Evaluation, _Evaluation, Estimate]]) -> None:
-    """Print a table of the runs, and one of the differences."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=160)  # a file has no width, and rich would fold at 80
+def _print_runs(evaluations: Sequence[_Evaluation], console: Console) -> None:
     name = next(iter(evaluations[0].entry["metrics"]))
     table = Table(title=escape(f"{name}, {evaluations[0].entry['sequences']} sequences, in nats"))
     for header in ("run", "family"):
@@ -189,18 +185,17 @@ def _print(evaluations: Sequence[_Evaluation], pairs: Sequence[tuple[_Evaluation
             f"{per_step.mean:.3f} ± {per_step.standard_error:.3f}", f"{reconstruction.mean:.2f}", f"{kl.mean:.2f}",
         )  # fmt: skip
     console.print(table)
-    if not pairs:
-        return
+
+
+def _print_pairs(pairs: Sequence[tuple[_Evaluation, _Evaluation, Estimate]], console: Console) -> None:
     table = Table(title="paired difference of the ELBO over the same sequences, in nats per sequence")
     for header in ("run", "minus"):
         table.add_column(header, overflow="fold")
     for header in ("difference", "standard errors from 0", "higher on"):
         table.add_column(header, justify="right")
-    for first, second, difference in pairs:
-        share = (first.bound.elbo > second.bound.elbo).double().mean().item()
-        mean, error = difference
+    for first, second, (mean, error) in pairs:
+        higher = (first.bound.elbo > second.bound.elbo).double().mean().item()
         ratio = f"{mean / error:+.1f}" if error > 0 else "n/a"
-        table.add_row(
-            escape(first.run.path), escape(second.run.path), f"{mean:+.2f} ± {error:.2f}", ratio, f"{share:.0%}"
-        )
+        paths = (escape(evaluation.run.path) for evaluation in (first, second))
+        table.add_row(*paths, f"{mean:+.2f} ± {error:.2f}", ratio, f"{higher:.0%}")
     console.print(table)
