@@ -2,9 +2,9 @@
 
     python benchmarks/train_step.py                one thread; writes the table beside this file
 
-All forms of a shape take turns, one update each, so that whatever else the machine does meets them alike. Times are
-medians of processor time, which other programs disturb less than the clock on the wall; with one thread both are the
-same on an idle machine. The table is about their ratios. Memory is measured in a fresh process per form.
+All forms of a shape take turns, one update each, so that whatever else the machine does meets them alike. Times are of
+the processor, which other programs disturb less than the clock on the wall; with one thread both are the same on an
+idle machine. The table is about the ratios, each the median over rounds. Memory is measured in a fresh process per form.
 """
 
 import argparse
@@ -89,17 +89,23 @@ class Update:
         return time.process_time() - start
 
 
-def interleaved(updates: dict[str, Update], repeats: int) -> dict[str, float]:
-    """Time updates in turns: medians in seconds, after two rounds that do not count."""
+def interleaved(updates: dict[str, Update], repeats: int) -> dict[str, list[float]]:
+    """Time updates in turns: the seconds of each round, after two rounds that do not count."""
     seconds: dict[str, list[float]] = {form: [] for form in updates}
     for _ in range(repeats + 2):
         for form, update in updates.items():
             seconds[form].append(update())
-    return {form: statistics.median(times[2:]) for form, times in seconds.items()}
+    return {form: times[2:] for form, times in seconds.items()}
+
+
+def ratio(times: list[float], others: list[float]) -> float:
+    """Compare two forms round by round and give the median."""
+    return statistics.median(a / b for a, b in zip(times, others, strict=True))
 
 
 def compiled(update: Update) -> float:
     """Compile the loss of an update without graph breaks and give the seconds until the first update is done."""
+    torch._inductor.config.force_disable_caches = True  # what an earlier run has left
     start = time.perf_counter()
     update.loss = torch.compile(update.eager_loss, fullgraph=True)
     update()
@@ -140,8 +146,9 @@ def measure(shape: str, options: argparse.Namespace) -> list[str]:
         rows["compiled"] = f" ({compiled(updates['compiled']):.0f} s to compile)"
     seconds = interleaved(updates, options.repeats)
     return [
-        f"| {shape} | {form}{note} | {1e3 * seconds[form]:.1f} | {seconds[form] / seconds['gaussian']:.2f} "
-        f"| {seconds['flow'] / seconds[form]:.2f} | {format(memories[form], '.0f') if form in memories else ''} |"
+        f"| {shape} | {form}{note} | {1e3 * statistics.median(seconds[form]):.0f} "
+        f"| {ratio(seconds[form], seconds['gaussian']):.2f} | {ratio(seconds[form], seconds['flow']):.2f} "
+        f"| {format(memories[form], '.0f') if form in memories else ''} |"
         for form, note in rows.items()
     ]
 
@@ -164,7 +171,7 @@ def main() -> None:
         f"median of {options.repeats} interleaved updates, DMC with {options.dmc_batch} sequences of 50 steps, "
         f"load average {os.getloadavg()[0]:.1f}.",
         "",
-        "| shape | form | ms per update | times gaussian's | flow is faster by | MiB that updates need |",
+        "| shape | form | ms per update | over gaussian | over flow | MiB that updates need |",
         "|---|---|---:|---:|---:|---:|",
     ]
     for shape in options.shapes:
