@@ -62,7 +62,7 @@ def elbo_against_updates(families: Sequence[Family], metric: str) -> Figure:
         for family in families:
             table = pd.concat(family.curves, axis=1).dropna()  # updates that all runs have
             mean, runs = table.mean(axis=1), len(family.curves)
-            label = family.name if runs == 1 else f"{family.name}, mean and range of {runs} runs"
+            label = family.name if runs == 1 else f"{family.name}, {runs} runs"
             axes.fill_between(table.index, table.min(axis=1), table.max(axis=1), color=family.colour, alpha=0.2, lw=0)
             axes.plot(table.index, mean, color=family.colour, label=label)
             if family.tests:

@@ -92,7 +92,7 @@ def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo
     assert rssm.get_ydata() == pytest.approx(curves[2])
     assert (marker.get_xdata(), marker.get_ydata()) == (10, -95.0)
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [
-        "FORBES, mean and range of 2 runs",
+        "FORBES, 2 runs",
         "RSSM",
         "test, at the end",
     ]
