@@ -4,7 +4,7 @@
 
 All forms of a shape take turns, one update each, so that whatever else the machine does meets them alike. Times are of
 the processor, which other programs disturb less than the clock on the wall; with one thread both are the same on an
-idle machine. The table is about the ratios, each the median over rounds. Memory is measured in a fresh process per form.
+idle machine. The ratios are medians over rounds. Memory is measured in a fresh process per form.
 """
 
 import argparse
