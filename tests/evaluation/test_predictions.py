@@ -18,8 +18,15 @@ def data(strokes_file):
 def model():
     torch.manual_seed(0)
     shape = (1, 28, 28)
-    model = StateSpaceModel(FlowBelief, MLPEncoder(shape, 8, 1), MLPDecoder(6, shape, 8, 1), Bernoulli(), 0, 2, 4, 8, 1)
+    model = StateSpaceModel(FlowBelief, MLPEncoder(shape, 8, 1), MLPDecoder(6, shape, 8, 1), Bernoulli(), 1, 2, 4, 8, 1)
     return model.eval()
+
+
+@pytest.fixture
+def batch(data):
+    """Five digits of nine steps, with an action of their own at each."""
+    action = torch.randn(5, 9, 1, generator=torch.Generator().manual_seed(0))
+    return data.sequences("test", torch.arange(5), 9)._replace(action=action)
 
 
 def seeded(model, batch, samples=3):
@@ -27,9 +34,7 @@ def seeded(model, batch, samples=3):
     return complete(model, batch, 4, samples)
 
 
-def test_a_completion_has_a_frame_for_each_step_that_was_not_seen(model, data):
-    batch = data.sequences("test", torch.arange(5), 9)
-
+def test_a_completion_has_a_frame_for_each_step_that_was_not_seen(model, batch):
     completions = seeded(model, batch)
 
     assert completions.frames.shape == (3, 5, 5, 1, 28, 28)
@@ -39,8 +44,7 @@ def test_a_completion_has_a_frame_for_each_step_that_was_not_seen(model, data):
     assert torch.equal(completions.at(9), completions.frames[:, :, -1])
 
 
-def test_a_completion_knows_the_prefix_and_nothing_else(model, data):
-    batch = data.sequences("test", torch.arange(5), 9)
+def test_a_completion_knows_the_prefix_and_nothing_else(model, batch):
     future = batch.observation.clone()
     future[:, 4:] = 1 - future[:, 4:]
     past = batch.observation.clone()
@@ -52,14 +56,13 @@ def test_a_completion_knows_the_prefix_and_nothing_else(model, data):
     assert not torch.equal(seeded(model, batch._replace(observation=past)).frames, frames)
 
 
-def test_samples_of_one_prefix_differ(model, data):
-    frames = seeded(model, data.sequences("test", torch.arange(5), 9), samples=4).frames
+def test_samples_of_one_prefix_differ(model, batch):
+    frames = seeded(model, batch, samples=4).frames
     assert len(frames.flatten(1).unique(dim=0)) == 4
 
 
-def test_a_sample_keeps_its_own_trajectory(model, data):
+def test_a_sample_keeps_its_own_trajectory(model, batch):
     """Rolling on the n-th belief alone gives the n-th completion: rows never mix."""
-    batch = data.sequences("test", torch.arange(5), 9)
     # Without the prior's noise the rest of a trajectory is a function of its start.
     model.prior.rsample = lambda context, sample_shape=(): (context[:, :2], context[:, 0])
     model.prior.sampler = lambda *bind: model.prior.rsample
