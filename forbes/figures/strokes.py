@@ -67,7 +67,8 @@ def elbo_against_updates(families: Sequence[Family], metric: str) -> Figure:
             axes.plot(table.index, mean, color=family.colour, label=label)
             if family.tests:
                 test = sum(family.tests) / len(family.tests)
-                axes.plot(table.index.max(), test, "D", color=family.colour, markersize=4, clip_on=False, zorder=3)
+                (end,) = axes.plot(table.index.max(), test, "D", color=family.colour, markersize=5, zorder=3)
+                end.set(markeredgecolor="white", clip_on=False)
         if any(family.tests for family in families):
             axes.plot([], [], "D", color="none", markeredgecolor="black", markersize=4, label="test, at the end")
         show_settled(axes, [curve for family in families for curve in family.curves])
