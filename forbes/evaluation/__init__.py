@@ -1,6 +1,9 @@
-"""Evaluation: bounds and predictions of finished models, by one convention (DESIGN §8)."""
+"""Evaluation: bounds, proper scores and predictions of finished models, by one convention (DESIGN §8)."""
 
-from forbes.evaluation.elbo import Bound, Estimate, evaluate_elbo, paired_difference, sample_terms
+from forbes.evaluation.bounds import score_trajectories
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.open_loop import score_open_loop
 from forbes.evaluation.predictions import Completions, complete
+from forbes.evaluation.smc import score_particles
 
-__all__ = ["Bound", "Completions", "Estimate", "complete", "evaluate_elbo", "paired_difference", "sample_terms"]
+__all__ = ["Completions", "Estimate", "complete", "score_open_loop", "score_particles", "score_trajectories"]

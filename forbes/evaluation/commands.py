@@ -1,94 +1,111 @@
-"""`forbes evaluate`: the ELBO of trained models on a whole split, and the paired difference of each two."""
+"""`forbes evaluate`: bounds and proper scores of trained models, and the paired difference of each two."""
 
-import itertools
+import hashlib
 import shlex
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
-from rich.table import Table
 
 from forbes.arguments import ArgumentParser, positive
 from forbes.data import SequenceBatch, Split
 from forbes.errors import ForbesError
-from forbes.evaluation.elbo import Bound, Estimate, evaluate_elbo, paired_difference
-from forbes.evaluation.record import bound_metrics, read_record, summary, write_record
+from forbes.evaluation.measured import Measured, pair
+from forbes.evaluation.record import describe, metric_name, read_record, write_record
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, split_batches
+from forbes.evaluation.scoring import PASSES, Parts, Pass, make_pass, score_split
+from forbes.evaluation.tables import print_pairs, print_runs
 from forbes.training.provenance import commit
+from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
 
-_DESCRIPTION = """\
-Measure the ELBO of trained models, and compare them on the same sequences.
+_SUBSET = 1000  # sequences that particles are spent on, unless --digits says otherwise
+
+_DESCRIPTION = f"""\
+Measure trained models by bounds and proper scores, and compare them on the same sequences.
 
   forbes evaluate runs/compare/forbes runs/compare/rssm
+  forbes evaluate runs/compare/forbes --scores elbo pll --digits 200
 
 Nats per sequence of observations, fully normalised, without free nats; the KL is the Monte-Carlo estimate for every
-family; mean and standard error over sequences. Writes evaluation.json, and evaluation.npz with each sequence's value,
-into each run folder."""
+family; mean and standard error over sequences. An ELBO alone does not tell a good belief: it prefers one that is too
+certain. So beside it:
 
-_ALL_PAIRS = 4  # runs up to which every two are compared; of more, each with the first
+  elbo       the bound and its parts, S trajectories, on the whole split
+  pll        log p(o_t | o_1..t-1) summed over t, by K particles of the belief: the proper score of the filtering
+             belief; and the IWAE bound, by the same trajectories
+  fivo       the sequential Monte-Carlo bound, by K particles, and their effective sample size
+  open-loop  log p(rest | beginning), by K futures that start in the belief
+
+The last three take the first {_SUBSET} sequences, and their names say so. Writes evaluation.json, and evaluation.npz
+with each sequence's scores, into each run folder. Interrupted, the same command goes on where it stopped."""
 
 
-class _Evaluation(NamedTuple):
-    """One run, measured."""
+class _Job(NamedTuple):
+    """A pass over the first so many sequences of a split."""
 
-    run: TrainedRun
-    split: str
-    """Its name, with the number of sequences where that is not all: `test[:1000]`."""
-    bound: Bound
-    entry: dict[str, Any]
-    """For `evaluation.json`."""
+    name: str
+    score: Pass
+    sequences: int
+    sha256: list[str]
+    """Of the sequences, as each run's data give them."""
 
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = _parser().parse_args(argv)
     runs = load_runs(args.runs, _device(args.device))
-    counts = [_count(run, args.split, args.digits) for run in runs]
-    hashes = [data_sha256(run.data, args.split, count) for run, count in zip(runs, counts, strict=True)]
-    require_comparable(runs, hashes)
+    jobs = _jobs(args, runs)
     for run in runs:
         read_record(run.path)  # a broken one is said before minutes are spent
-    evaluations = []
-    for run in runs:
-        evaluation = _evaluate(run, args, counts[0])
-        evaluation.entry.update(
-            data={"name": data_name(run.data), "sha256": hashes[0]},
-            command=shlex.join(["forbes", "evaluate", *argv]),
-            commit=commit(),
-            date=datetime.now(UTC).isoformat(timespec="seconds"),
-        )
-        evaluations.append(evaluation)
-    pairs = _pair(evaluations)
-    for evaluation in evaluations:
-        write_record(evaluation.run.path, evaluation.split, evaluation.entry, evaluation.bound)
-    console = Console(width=None if sys.stdout.isatty() else 160)  # into a file, rich would fold at 80
-    _print_runs(evaluations, console)
+    origin = {"command": shlex.join(["forbes", "evaluate", *argv]), "commit": commit(), "seed": args.seed}
+    finished: list[Parts] = []
+    measured = []
+    for number, run in enumerate(runs):
+        one = Measured(run, {}, {})
+        for job in jobs:
+            finished.append(_measure(one, job, job.sha256[number], args))
+        for entry in one.entries.values():
+            entry.update(origin, date=datetime.now(UTC).isoformat(timespec="seconds"))
+        measured.append(one)
+    pairs = pair(measured)
+    for one in measured:
+        write_record(one.run.path, one.entries, one.totals)
+    for parts in finished:
+        parts.remove()
+    print_runs(measured)
     if pairs:
-        _print_pairs(pairs, console)
+        print_pairs(pairs)
 
 
 def _parser() -> ArgumentParser:
     parser = ArgumentParser("forbes evaluate", _DESCRIPTION)
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made")
+    parser.add_argument("--scores", nargs="+", choices=PASSES, default=PASSES, help="default: all")
     parser.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
-    parser.add_argument("--samples", type=positive, default=16, help="S, trajectories per sequence (default: 16)")
-    parser.add_argument("--digits", type=_all_or_number, default=None, help="all (default), or only the first so many")
+    parser.add_argument(
+        "--digits", type=_all_or_number, default=None, help="all, or only the first so many, for every score"
+    )
+    parser.add_argument("--samples", type=positive, default=16, help="S of the ELBO (default: 16)")
+    parser.add_argument("--particles", type=positive, default=128, help="K of PLL, IWAE and FIVO (default: 128)")
+    parser.add_argument("--futures", type=positive, default=1000, help="K of the open-loop score (default: 1000)")
+    parser.add_argument("--context", type=positive, default=15, help="steps seen by the open-loop score (default: 15)")
     parser.add_argument("--batch-size", type=positive, default=250, help="sequences at a time (default: 250)")
-    parser.add_argument("--seed", type=int, default=0, help="of the posterior's noise (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise (default: 0)")
     parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda, cuda:1 …")
     return parser
 
 
-def _all_or_number(text: str) -> int | None:
-    return None if text == "all" else positive(text)
+def _all_or_number(text: str) -> int:
+    return sys.maxsize if text == "all" else positive(text)
 
 
 def _device(name: str) -> str:
@@ -103,41 +120,61 @@ def _device(name: str) -> str:
     return chosen
 
 
-def _count(run: TrainedRun, split: Split, wanted: int | None) -> int:
-    size = run.data.source.size(split)
-    if wanted is not None and wanted > size:
-        raise ForbesError(f"--digits {wanted}: the {split} split of {run.path} has {size} sequences. Choose fewer")
-    if (count := wanted or size) < 2:
+def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
+    """Say which passes to make, on how many sequences; refuse runs that cannot be compared there."""
+    numbers = {"elbo": args.samples, "pll": args.particles, "fivo": args.particles, "open-loop": args.futures}
+    hashes: dict[int, list[str]] = {}
+    jobs = []
+    for name in (name for name in PASSES if name in args.scores):
+        count = _count(runs[0], args, _SUBSET if name != "elbo" else sys.maxsize)
+        if count not in hashes:
+            for run in runs:
+                _count(run, args, count)
+            hashes[count] = [data_sha256(run.data, args.split, count) for run in runs]
+            require_comparable(runs, hashes[count])
+        jobs.append(_Job(name, make_pass(name, numbers[name], args.batch_size, args.context), count, hashes[count]))
+    length = runs[0].data.length
+    if "open-loop" in args.scores and args.context >= length:
+        raise ForbesError(
+            f"--context {args.context}: the sequences of {runs[0].path} have {length} steps, expected a context below "
+            "that. Choose a smaller one, or name other --scores"
+        )
+    return jobs
+
+
+def _count(run: TrainedRun, args: Any, default: int) -> int:
+    """Give the number of sequences to score."""
+    size = run.data.source.size(args.split)
+    wanted = min(default, size) if args.digits is None else args.digits
+    if sys.maxsize > wanted > size:
+        raise ForbesError(f"--digits {wanted}: the {args.split} split of {run.path} has {size} sequences. Choose fewer")
+    if (count := min(wanted, size)) < 2:
         raise ForbesError(f"--digits {count}: a standard error needs at least 2 sequences. Choose more")
     return count
 
 
-def _evaluate(run: TrainedRun, args: Any, sequences: int) -> _Evaluation:
-    """Measure one run."""
-    split = args.split if sequences == run.data.source.size(args.split) else f"{args.split}[:{sequences}]"
-    batches = split_batches(run.data, args.split, sequences, args.batch_size)
-    device = next(run.model.parameters()).device
-    began = time.monotonic()
-    bound = evaluate_elbo(
-        run.model,
-        _progress(batches, run.path, sequences),
-        args.samples,
-        args.seed,
-        device,
-        f"{run.path}, {split} split",
+def _measure(one: Measured, job: _Job, sha256: str, args: Any) -> Parts:
+    """Make a pass for a run and add what it finds; give the parts it has left, to be removed in the end."""
+    run, score = one.run, job.score
+    whole = job.sequences == run.data.source.size(args.split)
+    split = args.split if whole else f"{args.split}[:{job.sequences}]"
+    checkpoint = hashlib.sha256(RunFolder(run.path).checkpoint.read_bytes()).hexdigest()
+    parts = Parts(
+        Path(run.path) / "evaluation-parts", checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed
     )
-    metrics = bound_metrics(bound, split, run.model.likelihood.name, args.samples)
-    entry = {
-        "metrics": {name: estimate._asdict() for name, estimate in metrics.items()},
-        "elbo_over_sequences": summary(bound),
-        "sequences": sequences,
-        "steps": int(bound.steps.sum()),
-        "samples": args.samples,
-        "seed": args.seed,
-        "device": str(device),
-        "seconds": round(time.monotonic() - began, 1),
-    }
-    return _Evaluation(run, split, bound, entry)
+    began = time.monotonic()
+    batches = split_batches(run.data, args.split, job.sequences, score.batch_size)
+    batches = _progress(batches, f"{run.path} {job.name}", job.sequences)
+    scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts)
+    for metric in score.metrics:
+        name = metric_name(split, metric, run.model.likelihood.name, score.tag)
+        one.totals[name] = scores.values[metric].sum(1)  # (N,)
+        one.entries[name] = describe(scores, metric) | {
+            "data": {"name": data_name(run.data), "sha256": sha256},
+            "device": str(next(run.model.parameters()).device),
+            "seconds": round(time.monotonic() - began, 1),
+        }
+    return parts
 
 
 def _progress(
@@ -155,47 +192,3 @@ def _progress(
             if bar.disable and 10 * done // sequences > tenth:
                 tenth = 10 * done // sequences
                 print(f"{name}: {done}/{sequences} sequences", file=sys.stderr, flush=True)
-
-
-def _pair(evaluations: Sequence[_Evaluation]) -> list[tuple[_Evaluation, _Evaluation, Estimate]]:
-    """Compare every two runs, or where there are many each with the first, and note it in both entries."""
-    pairs = []
-    for first, second in itertools.combinations(evaluations, 2):
-        if len(evaluations) > _ALL_PAIRS and first is not evaluations[0]:
-            break
-        difference = paired_difference(first.bound, second.bound)
-        pairs.append((first, second, difference))
-        for one, other, sign in [(first, second, 1), (second, first, -1)]:
-            paired = {"minus": other.run.path, "elbo": sign * difference.mean}
-            one.entry.setdefault("paired", []).append(paired | {"standard_error": difference.standard_error})
-    return pairs
-
-
-def _print_runs(evaluations: Sequence[_Evaluation], console: Console) -> None:
-    name = next(iter(evaluations[0].entry["metrics"]))
-    table = Table(title=escape(f"{name}, {evaluations[0].entry['sequences']} sequences, in nats"))
-    for header in ("run", "family"):
-        table.add_column(header, overflow="fold")
-    for header in ("parameters", "ELBO per sequence", "per step", "reconstruction", "KL"):
-        table.add_column(header, justify="right")
-    for run, _, _, entry in evaluations:
-        elbo, per_step, reconstruction, kl = (Estimate(**metric) for metric in entry["metrics"].values())
-        table.add_row(
-            escape(run.path), run.family, f"{run.parameters:,}", f"{elbo.mean:.2f} ± {elbo.standard_error:.2f}",
-            f"{per_step.mean:.3f} ± {per_step.standard_error:.3f}", f"{reconstruction.mean:.2f}", f"{kl.mean:.2f}",
-        )  # fmt: skip
-    console.print(table)
-
-
-def _print_pairs(pairs: Sequence[tuple[_Evaluation, _Evaluation, Estimate]], console: Console) -> None:
-    table = Table(title="paired difference of the ELBO over the same sequences, in nats per sequence")
-    for header in ("run", "minus"):
-        table.add_column(header, overflow="fold")
-    for header in ("difference", "standard errors from 0", "higher on"):
-        table.add_column(header, justify="right")
-    for first, second, (mean, error) in pairs:
-        higher = (first.bound.elbo > second.bound.elbo).double().mean().item()
-        ratio = f"{mean / error:+.1f}" if error > 0 else "n/a"
-        paths = (escape(evaluation.run.path) for evaluation in (first, second))
-        table.add_row(*paths, f"{mean:+.2f} ± {error:.2f}", ratio, f"{higher:.0%}")
-    console.print(table)

@@ -1,7 +1,8 @@
 """What an evaluation leaves in a run folder: `evaluation.json` for people, `evaluation.npz` for programs.
 
-Both hold one entry for each split that was evaluated; evaluating it again replaces the entry. The entries of the first
-so many sequences are named after them: `test[:1000]`.
+Both hold one entry for each metric, by its full name, which says the split (`test`, or `test[:1000]` for its first
+so many sequences), the score, the likelihood and the numbers of samples: `test[:1000]/pll[bernoulli,K=128]`.
+Measuring a metric again replaces its entry.
 """
 
 import io
@@ -10,31 +11,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from torch import Tensor
 
 from forbes.errors import ForbesError
-from forbes.evaluation.elbo import Bound, Estimate
+from forbes.evaluation.estimates import Estimate, bootstrap_interval
+from forbes.evaluation.scoring import Scores
 from forbes.files import replace_file
 
-__all__ = ["bound_metrics", "read_record", "summary", "write_record"]
+__all__ = ["describe", "metric_name", "read_record", "write_record"]
 
 
-def bound_metrics(bound: Bound, split: str, likelihood: str, samples: int) -> dict[str, Estimate]:
-    """Name the bound and its parts: the likelihood and the number of samples belong to the name."""
-    tag = f"[{likelihood},S={samples}]"
-    return {
-        f"{split}/elbo{tag}": Estimate.of(bound.elbo),
-        f"{split}/elbo_per_step{tag}": bound.per_step(),
-        f"{split}/reconstruction{tag}": Estimate.of(bound.reconstruction),
-        f"{split}/kl{tag}": Estimate.of(bound.kl),
-    }
+def metric_name(split: str, metric: str, likelihood: str, tag: str) -> str:
+    """Name a metric: `test/elbo[bernoulli,S=16]`."""
+    return f"{split}/{metric}[{likelihood},{tag}]"
 
 
-def summary(bound: Bound) -> dict[str, float]:
-    """Describe the spread of the ELBO over sequences, in nats."""
+def describe(scores: Scores, metric: str) -> dict[str, Any]:
+    """Describe the metric over sequences: the entry of `evaluation.json`, all in nats."""
+    values, steps = scores.values[metric], scores.steps
+    total = values.sum(1)  # (N,)
     shares = {"minimum": 0.0, "5%": 0.05, "median": 0.5, "95%": 0.95, "maximum": 1.0}
-    elbo = bound.elbo.numpy()
-    return {name: float(np.quantile(elbo, share)) for name, share in shares.items()} | {"std": float(elbo.std(ddof=1))}
+    counts = scores.mask.sum(0)  # (T,)
+    return {
+        **Estimate.of(total)._asdict(),
+        "interval_95": bootstrap_interval(total),
+        "per_step": Estimate.per_step(total, steps)._asdict(),
+        "curve": (values.sum(0) / counts.clamp(min=1)).tolist(),
+        "quantiles": {name: total.quantile(share).item() for name, share in shares.items()},
+        "sequences": len(total),
+        "steps": int(steps.sum()),
+    }
 
 
 def read_record(run: str) -> dict[str, Any]:
@@ -49,20 +55,14 @@ def read_record(run: str) -> dict[str, Any]:
     return record
 
 
-def write_record(run: str, split: str, entry: dict[str, Any], bound: Bound) -> None:
-    """Replace the entry of a split in `evaluation.json`, and its per-sequence values in `evaluation.npz`."""
-    record = read_record(run) | {split: entry}
-    arrays = _read_arrays(Path(run) / "evaluation.npz")
-    arrays |= {f"{split}/{name}": values.numpy() for name, values in bound._asdict().items()}
+def write_record(run: str, entries: dict[str, dict[str, Any]], totals: dict[str, Tensor]) -> None:
+    """Replace entries of `evaluation.json`, and the scores of each sequence, `(N,)`, in `evaluation.npz`."""
+    path, record = Path(run) / "evaluation.npz", read_record(run) | entries
+    arrays = {name: values.numpy() for name, values in totals.items()}
+    if path.exists():
+        with np.load(path, allow_pickle=False) as old:
+            arrays = dict(old) | arrays
     content = io.BytesIO()
     np.savez(content, **arrays)  # type: ignore[arg-type]  # numpy's stub takes the names for options
-    replace_file(Path(run) / "evaluation.npz", content.getvalue())
+    replace_file(path, content.getvalue())
     replace_file(Path(run) / "evaluation.json", (json.dumps(record, indent=2) + "\n").encode())
-
-
-def _read_arrays(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Read the per-sequence values, none before the first evaluation."""
-    if not path.exists():
-        return {}
-    with np.load(path, allow_pickle=False) as arrays:
-        return dict(arrays)

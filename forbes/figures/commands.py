@@ -98,8 +98,7 @@ def _curve(run: TrainedRun) -> pd.Series:
 
 def _test_elbo(run: TrainedRun) -> float | None:
     """Give what `forbes evaluate` found on the whole test split, if it was asked."""
-    metrics = read_record(run.path).get("test", {}).get("metrics", {})
-    return next((metric["mean"] for name, metric in metrics.items() if name.startswith("test/elbo[")), None)
+    return next((entry["mean"] for name, entry in read_record(run.path).items() if name.startswith("test/elbo[")), None)
 
 
 def _index(index: Sequence[int], size: int) -> torch.Tensor:

@@ -2,14 +2,16 @@
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
 from forbes.cli import main
-from forbes.evaluation.elbo import evaluate_elbo
+from forbes.evaluation import scoring
 from forbes.evaluation.runs import load_runs, split_batches
+from forbes.evaluation.scoring import Parts, make_pass, score_split
 from forbes.training.run_folder import RunFolder
 
 NAME = "test/elbo[bernoulli,S=2]"
@@ -36,7 +38,7 @@ def runs(trained, tmp_path):
 
 
 def evaluate(*arguments):
-    return main(["evaluate", *arguments, "--samples", "2"])
+    return main(["evaluate", *arguments, "--samples", "2", *([] if "--scores" in arguments else ["--scores", "elbo"])])
 
 
 def record(run):
@@ -56,54 +58,114 @@ def error_of(capsys, *arguments):
     return line
 
 
+def arrays_of(run):
+    with np.load(RunFolder(run).path / "evaluation.npz") as arrays:
+        return dict(arrays)
+
+
 def test_records_the_mean_over_the_whole_split_and_every_sequence(runs):
     assert evaluate(*runs, "--batch-size", "5") == 0
 
     for run in load_runs(runs):
-        bound = evaluate_elbo(run.model, split_batches(run.data, "test", 12, 5), samples=2)
-        metrics = record(run.path)["test"]["metrics"]
-        assert metrics[NAME]["mean"] == pytest.approx(bound.elbo.mean().item(), rel=1e-12)
-        assert metrics[NAME]["standard_error"] == pytest.approx(bound.elbo.numpy().std(ddof=1) / 12**0.5)
-        with np.load(RunFolder(run.path).path / "evaluation.npz") as arrays:
-            assert arrays["test/elbo"].dtype == np.float64
-            np.testing.assert_array_equal(arrays["test/elbo"], bound.elbo.numpy())
-            per_step = arrays["test/elbo"].sum() / arrays["test/steps"].sum()
-        assert metrics["test/elbo_per_step[bernoulli,S=2]"]["mean"] == pytest.approx(per_step)
+        scores = score_split(run.model, split_batches(run.data, "test", 12, 5), make_pass("elbo", 2, 5, 1))
+        elbo, entry, array = scores.values["elbo"].sum(1), record(run.path)[NAME], arrays_of(run.path)[NAME]
+        assert entry["mean"] == pytest.approx(elbo.mean().item(), rel=1e-12)
+        assert entry["standard_error"] == pytest.approx(elbo.numpy().std(ddof=1) / 12**0.5)
+        assert entry["interval_95"][0] < entry["mean"] < entry["interval_95"][1]
+        assert array.dtype == np.float64
+        np.testing.assert_array_equal(array, elbo.numpy())
+        assert entry["per_step"]["mean"] == pytest.approx(array.sum() / entry["steps"])
+        counts = scores.mask.sum(0)
+        assert (torch.tensor(entry["curve"]) * counts).sum().item() == pytest.approx(array.sum(), rel=1e-5)
 
 
 def test_records_where_the_numbers_come_from(runs):
     evaluate(*runs, "--seed", "3")
-    entry = record(runs[0])["test"]
-    assert entry["command"] == f"forbes evaluate {runs[0]} {runs[1]} --seed 3 --samples 2"
+    entry = record(runs[0])[NAME]
+    assert entry["command"] == f"forbes evaluate {runs[0]} {runs[1]} --seed 3 --samples 2 --scores elbo"
     assert {"commit", "date", "seconds", "device"} <= entry.keys()
-    assert (entry["sequences"], entry["samples"], entry["seed"]) == (12, 2, 3)
+    assert (entry["sequences"], entry["seed"]) == (12, 3)
     assert entry["data"]["name"].startswith("Strokes(origin=bundled")
-    assert entry["data"]["sha256"] == record(runs[1])["test"]["data"]["sha256"]
+    assert entry["data"]["sha256"] == record(runs[1])[NAME]["data"]["sha256"]
+
+
+def test_every_score_is_measured_by_default_and_named_with_its_numbers(runs, capsys):
+    numbers = ["--samples", "2", "--particles", "3", "--futures", "4", "--context", "2", "--digits", "5"]
+    assert main(["evaluate", *runs, *numbers]) == 0
+
+    names = [
+        *("elbo[bernoulli,S=2]", "reconstruction[bernoulli,S=2]", "kl[bernoulli,S=2]"),
+        *("iwae[bernoulli,K=3]", "pll[bernoulli,K=3]", "fivo[bernoulli,K=3]", "ess[bernoulli,K=3]"),
+        *("open_loop[bernoulli,K=4,c=2]", "open_loop_marginal[bernoulli,K=4,c=2]"),
+    ]
+    entries = record(runs[0])
+    assert list(entries) == [f"test[:5]/{name}" for name in names]
+    assert [name for name in entries if "paired" in entries[name]] == [f"test[:5]/{names[i]}" for i in (0, 3, 4, 5, 7)]
+    assert 1 / 3 <= entries["test[:5]/ess[bernoulli,K=3]"]["per_step"]["mean"] <= 1
+    assert not any(entries["test[:5]/open_loop[bernoulli,K=4,c=2]"]["curve"][:2])
+    out = capsys.readouterr().out
+    assert all(name in out for name in ("elbo", "iwae", "pll", "fivo", "open_loop", "[bernoulli,K=4,c=2]"))
 
 
 def test_both_runs_record_the_same_paired_difference(runs, capsys):
     evaluate(*runs)
 
-    (mine,), (theirs,) = (record(run)["test"]["paired"] for run in runs)
-    first, second = (np.load(RunFolder(run).path / "evaluation.npz")["test/elbo"] for run in runs)
+    (mine,), (theirs,) = (record(run)[NAME]["paired"] for run in runs)
+    first, second = (arrays_of(run)[NAME] for run in runs)
     assert mine["minus"] == runs[1]
-    assert mine["elbo"] == pytest.approx((first - second).mean()) == -theirs["elbo"]
+    assert mine["mean"] == pytest.approx((first - second).mean()) == -theirs["mean"]
     assert mine["standard_error"] == pytest.approx((first - second).std(ddof=1) / 12**0.5)
-    assert f"{mine['elbo']:+.2f} ± {mine['standard_error']:.2f}" in capsys.readouterr().out
+    assert f"{mine['mean']:+.2f} ± {mine['standard_error']:.2f}" in capsys.readouterr().out
+
+
+def test_an_interrupted_evaluation_goes_on_where_it_stopped(runs, monkeypatch):
+    evaluate(runs[0], "--batch-size", "5")
+    whole, calls = record(runs[0])[NAME], []
+
+    def counted(*arguments, stop_at=10**9):
+        calls.append(1)
+        if len(calls) == stop_at:
+            raise KeyboardInterrupt
+        return score(*arguments)
+
+    score = scoring._score
+    monkeypatch.setattr(scoring, "_score", partial(counted, stop_at=3))
+    assert evaluate(runs[0], "--batch-size", "5") == 130
+    monkeypatch.setattr(scoring, "_score", counted)
+    assert evaluate(runs[0], "--batch-size", "5") == 0
+
+    assert len(calls) == 3 + 1  # two batches and the stop, then the third batch
+    assert record(runs[0])[NAME]["curve"] == whole["curve"]
+    assert not list((RunFolder(runs[0]).path / "evaluation-parts").iterdir())
+
+
+def test_what_an_interrupted_evaluation_left_is_not_used_for_another_checkpoint_or_seed(runs, monkeypatch):
+    monkeypatch.setattr(Parts, "remove", lambda self: None)
+    evaluate(runs[0])
+    first = record(runs[0])[NAME]["mean"]
+    evaluate(runs[0], "--seed", "1")
+    assert record(runs[0])[NAME]["mean"] != first
+
+    path = RunFolder(runs[0]).checkpoint
+    checkpoint = torch.load(path, weights_only=True)
+    checkpoint["state_dict"]["model.gru.bias_hh"] += 1
+    torch.save(checkpoint, path)
+    evaluate(runs[0])
+    assert record(runs[0])[NAME]["mean"] != first
 
 
 def test_more_than_four_runs_are_compared_with_the_first_only(runs, tmp_path):
     copies = [str(shutil.copytree(runs[0], tmp_path / f"copy{number}")) for number in range(4)]
     evaluate(runs[1], *copies)
-    assert len(record(runs[1])["test"]["paired"]) == 4
-    assert [pair["minus"] for pair in record(copies[2])["test"]["paired"]] == [runs[1]]
+    assert len(record(runs[1])[NAME]["paired"]) == 4
+    assert [pair["minus"] for pair in record(copies[2])[NAME]["paired"]] == [runs[1]]
 
 
 def test_the_same_command_gives_the_same_numbers(runs):
     evaluate(runs[0])
-    first = record(runs[0])["test"]["metrics"]
+    first = record(runs[0])[NAME]
     evaluate(runs[0])
-    assert record(runs[0])["test"]["metrics"] == first
+    assert record(runs[0])[NAME]["curve"] == first["curve"]
 
 
 def test_each_split_and_subset_keeps_its_own_entry(runs):
@@ -111,17 +173,15 @@ def test_each_split_and_subset_keeps_its_own_entry(runs):
     evaluate(runs[0], "--split", "validation")
     evaluate(runs[0], "--digits", "5")
 
-    assert record(runs[0]).keys() == {"test", "validation", "test[:5]"}
-    assert "validation/elbo[bernoulli,S=2]" in record(runs[0])["validation"]["metrics"]
-    assert "test[:5]/elbo[bernoulli,S=2]" in record(runs[0])["test[:5]"]["metrics"]
-    with np.load(RunFolder(runs[0]).path / "evaluation.npz") as arrays:
-        np.testing.assert_allclose(arrays["test[:5]/steps"], arrays["test/steps"][:5])
+    names = [NAME, "validation/elbo[bernoulli,S=2]", "test[:5]/elbo[bernoulli,S=2]"]
+    assert [name for name in record(runs[0]) if "/elbo[" in name] == names
+    assert [len(arrays_of(runs[0])[name]) for name in names] == [12, 20, 5]
 
 
 def test_the_table_names_families_and_the_metric_with_its_likelihood(runs, capsys):
     evaluate(*runs)
     out = capsys.readouterr().out
-    assert NAME in out
+    assert all(part in out for part in ("test", "elbo", "[bernoulli,S=2]"))
     assert "FORBES" in out
     assert "RSSM wide" in out  # from the experiment's name
 
@@ -150,7 +210,7 @@ def test_a_broken_model_fails_and_names_run_and_sequence(runs, capsys):
     checkpoint["state_dict"]["model.gru.weight_hh"].fill_(torch.nan)
     torch.save(checkpoint, path)
 
-    assert f"{runs[0]}, test split: the ELBO of sequence 0 is nan" in error_of(capsys, runs[0])
+    assert f"{runs[0]}, test split: the elbo of sequence 0 is nan" in error_of(capsys, runs[0])
     assert record_is_missing(runs[0])
 
 
@@ -159,6 +219,8 @@ def test_wrong_arguments_are_named(runs, tmp_path, capsys):
     assert "at least 2" in error_of(capsys, runs[0], "--digits", "1")
     assert "the test split" in error_of(capsys, runs[0], "--digits", "13")
     assert "--digits" in error_of(capsys, runs[0], "--digits", "most")
+    assert "have 6 steps" in error_of(capsys, runs[0], "--scores", "open-loop", "--context", "6")
+    assert "invalid choice: 'bleu'" in error_of(capsys, runs[0], "--scores", "bleu")
     assert "--device moon" in error_of(capsys, runs[0], "--device", "moon")
     assert "no such run folder" in error_of(capsys, str(tmp_path / "nowhere"))
     (RunFolder(runs[0]).path / "evaluation.json").write_text("{")

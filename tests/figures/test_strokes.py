@@ -81,7 +81,7 @@ def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo
     copies = [str(shutil.copytree(run, tmp_path / str(number))) for number, run in enumerate(runs)]
     for copy, mean in zip(copies, (-90.0, -100.0), strict=False):
         metric = {"test/elbo[bernoulli,S=16]": {"mean": mean, "standard_error": 1.0}}
-        (tmp_path / copy / "evaluation.json").write_text(json.dumps({"test": {"metrics": metric}}))
+        (tmp_path / copy / "evaluation.json").write_text(json.dumps(metric))
 
     (axes,) = elbo_against_updates(group(load_runs(copies)), "ELBO").axes
 

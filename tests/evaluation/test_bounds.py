@@ -1,7 +1,5 @@
 """The evaluated bound is its definition, sequence by sequence and step by step."""
 
-import math
-
 import pytest
 import torch
 from torch import nn
@@ -9,7 +7,8 @@ from torch import nn
 from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.evaluation.elbo import Bound, Estimate, evaluate_elbo, paired_difference, sample_terms
+from forbes.evaluation.bounds import trajectories
+from forbes.evaluation.scoring import make_pass, score_split
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, Normal, StateSpaceModel
 from forbes.seeding import derive_seed
 
@@ -62,6 +61,12 @@ def float64(monkeypatch):
     monkeypatch.setattr(torch.Tensor, "float", torch.Tensor.double)
 
 
+def elbo(model, batches, samples, **options):
+    """The pass that `forbes evaluate` makes; its scores summed over the steps, (N,)."""
+    scores = score_split(model, batches, make_pass("elbo", samples, 1, 1), **options)
+    return {name: values.sum(1) for name, values in scores.values.items()}
+
+
 def plain_elbo(model, observation, action, steps):
     """J of one sequence, a step at a time: filter, decode, compare (DESIGN §5)."""
     hidden, state = model.initial(1)
@@ -84,19 +89,18 @@ def plain_elbo(model, observation, action, steps):
 @pytest.mark.parametrize("likelihood", [Bernoulli(), Normal(0.7, scale=1.0)], ids=lambda likelihood: likelihood.name)
 @pytest.mark.parametrize("batch_size", [1, 3, 7])
 def test_equals_a_plain_loop_over_sequences_and_steps(likelihood, batch_size, monkeypatch):
-    monkeypatch.setattr("forbes.evaluation.elbo._FRAMES", 4)  # several parts, and the last one shorter
+    monkeypatch.setattr("forbes.evaluation.bounds._FRAMES", 4)  # several parts, and the last one shorter
     model, batch = make_model(likelihood=likelihood), make_batch()
 
-    bound = evaluate_elbo(model, in_batches(batch, batch_size), samples=2)
+    scores = elbo(model, in_batches(batch, batch_size), samples=2)
 
     with torch.no_grad():
         expected = [
             plain_elbo(model, observation, action, int(mask.sum()))
             for observation, action, _, mask in zip(*batch, strict=True)
         ]
-    torch.testing.assert_close(bound.elbo, torch.tensor(expected, dtype=torch.float64))
-    torch.testing.assert_close(bound.reconstruction - bound.kl, bound.elbo)
-    assert bound.steps.tolist() == batch.mask.sum(1).tolist()
+    torch.testing.assert_close(scores["elbo"], torch.tensor(expected, dtype=torch.float64))
+    torch.testing.assert_close(scores["reconstruction"] - scores["kl"], scores["elbo"])
 
 
 @pytest.mark.parametrize("belief", [GaussianBelief, FlowBelief])
@@ -104,43 +108,48 @@ def test_its_samples_are_estimates_of_the_bound_that_is_trained(belief):
     model, batch = make_model(belief), make_batch()
     with torch.no_grad():
         torch.manual_seed(3)
-        reconstruction, kl = sample_terms(model, batch, samples=3)
+        drawn = list(trajectories(model, batch, 3, predict=False))
         torch.manual_seed(3)
         expected = [model.elbo(batch.observation, batch.action, batch.mask) for _ in range(3)]
 
-    torch.testing.assert_close(reconstruction, torch.stack([terms.reconstruction for terms in expected]))
-    torch.testing.assert_close(kl, torch.stack([terms.kl for terms in expected]))
+    for trajectory, terms in zip(drawn, expected, strict=True):
+        torch.testing.assert_close(trajectory.reconstruction, terms.reconstruction)
+        torch.testing.assert_close(trajectory.kl, terms.kl)
 
 
 def test_the_reported_value_is_the_mean_over_samples_and_depends_on_the_seed_alone():
     model, batch = make_model(FlowBelief), make_batch()
-    bound = evaluate_elbo(model, in_batches(batch, 7), samples=4, seed=2)
+    mine = elbo(model, in_batches(batch, 7), samples=4, seed=2)["elbo"]
 
     with torch.no_grad():
         torch.manual_seed(derive_seed(2, "evaluation", 0))
         bounds = [model.elbo(batch.observation, batch.action, batch.mask).elbo for _ in range(4)]
 
-    torch.testing.assert_close(bound.elbo, torch.stack(bounds).mean(0))
-    other = evaluate_elbo(model, in_batches(batch, 7), samples=4, seed=3)
-    assert (other.elbo != bound.elbo).all()
+    torch.testing.assert_close(mine, torch.stack(bounds).mean(0))
+    assert (elbo(model, in_batches(batch, 7), samples=4, seed=3)["elbo"] != mine).all()
 
 
 def test_what_lies_on_padding_does_not_count():
     model, batch = make_model(FlowBelief), make_batch()
     other = torch.where(batch.mask[:, :, None, None, None], batch.observation, 1 - batch.observation)
 
-    bound = evaluate_elbo(model, in_batches(batch, 4), samples=2)
-    changed = evaluate_elbo(model, in_batches(batch._replace(observation=other), 4), samples=2)
-
     assert not torch.equal(other, batch.observation)
-    torch.testing.assert_close(changed.elbo, bound.elbo, rtol=0, atol=0)
+    for name, number in [("elbo", 2), ("pll", 2), ("fivo", 3), ("open-loop", 2)]:
+        score = make_pass(name, number, 4, context=2)
+        true, changed = (
+            score_split(model, in_batches(batch._replace(observation=values), 4), score)
+            for values in (batch.observation, other)
+        )
+        for metric in score.metrics:
+            torch.testing.assert_close(changed.values[metric], true.values[metric], rtol=0, atol=0)
+            assert not true.values[metric][~batch.mask].any()
 
 
 def test_leaves_the_random_state_as_it_was():
     model = make_model(FlowBelief)
     before = torch.get_rng_state()
 
-    evaluate_elbo(model, in_batches(make_batch(), 4), samples=2)
+    elbo(model, in_batches(make_batch(), 4), samples=2)
 
     assert torch.equal(torch.get_rng_state(), before)
 
@@ -150,25 +159,5 @@ def test_a_value_that_is_not_a_number_is_named():
     observation = batch.observation.double()
     observation[5, 0] = torch.nan
 
-    with pytest.raises(ForbesError, match=r"^runs/a, test split: the ELBO of sequence 5 is nan"):
-        evaluate_elbo(make_model(), in_batches(batch._replace(observation=observation), 3), where="runs/a, test split")
-
-
-def test_a_paired_difference_is_the_mean_of_differences_with_its_error():
-    first = torch.tensor([-10.0, -20.0, -60.0, -30.0], dtype=torch.float64)
-    second = torch.tensor([-11.0, -24.0, -61.0, -36.0], dtype=torch.float64)
-    bounds = [Bound(elbo, elbo, elbo, torch.ones(4)) for elbo in (first, second)]
-
-    # By hand: differences 1, 4, 1, 6; mean 3; squares around it 4 + 1 + 4 + 9 = 18; √(18 / 3) / √4.
-    assert paired_difference(*bounds) == pytest.approx(Estimate(3.0, math.sqrt(6) / 2))
-
-
-def test_nats_per_step_divide_all_nats_by_all_steps():
-    elbo = torch.tensor([-10.0, -20.0, -60.0], dtype=torch.float64)
-    steps = torch.tensor([2.0, 3.0, 5.0], dtype=torch.float64)
-
-    estimate = Bound(elbo, elbo, elbo, steps).per_step()
-
-    # By hand: -90 / 10; what each sequence is above -9 a step is 8, 7, -15, over 10 / 3 steps.
-    assert estimate.mean == pytest.approx(-9.0)
-    assert estimate.standard_error == pytest.approx(math.sqrt((8**2 + 7**2 + 15**2) / 2) * 0.3 / math.sqrt(3))
+    with pytest.raises(ForbesError, match=r"^runs/a, test split: the elbo of sequence 5 is nan"):
+        elbo(make_model(), in_batches(batch._replace(observation=observation), 3), 2, where="runs/a, test split")

@@ -1,0 +1,133 @@
+r"""Bounds and scores from independent posterior trajectories, by one convention (DESIGN §8).
+
+Observation log-likelihood only, fully normalised, in nats; no free nats; the Monte-Carlo KL for every family; padding
+does not count; logarithms and sums of probabilities in float64. With
+:math:`w_t = p(o_t \mid h_t, s_t)\, p(s_t \mid h_t) / q(s_t \mid h_t, e_t)` along a trajectory of the posterior,
+
+.. math::
+
+    \mathrm{ELBO} = E_q \sum_t \log w_t \;\le\;
+    \mathrm{IWAE}_K = E \log \frac1K \sum_k \prod_t w_t^k \;\le\; \log p(o_{1:T}), \qquad
+    \mathrm{PLL} = \sum_t \log \frac1K \sum_k p(o_t \mid h_t^k, \tilde s_t^k), \quad
+    \tilde s_t^k \sim p(\cdot \mid h_t^k)
+
+The product over time is inside the mean over particles (Burda et al., 2016, arXiv 1509.00519). The PLL scores the
+filtering belief: its particles are drawn from the belief after t - 1 observations (h_t follows from it) and see o_t
+only in their score, so it is a proper score of the belief, and its K-sample form a lower bound of itself (Jensen).
+"""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forbes.data import SequenceBatch
+from forbes.models import StateSpaceModel
+
+__all__ = ["Increments", "LogMeanExp", "Trajectory", "frame_log_prob", "score_trajectories", "trajectories"]
+
+Increments = dict[str, Tensor]
+"""Scores by name, `(B, T)` each in nats, float64: what each step adds; the sum over t is the sequence's score."""
+
+_FRAMES = 1000
+"""Decoded at a time: the memory stays bounded, and a digit's pixels in the processor's cache (a third less time)."""
+
+
+class Trajectory(NamedTuple):
+    """One sample of the posterior along every sequence of a batch, in nats, float64."""
+
+    reconstruction: Tensor
+    """log p(o_t | h_t, s_t), `(B, T)`."""
+    kl: Tensor
+    """log q(s_t) - log p(s_t), `(B, T)`."""
+    prediction: Tensor | None
+    """log p(o_t | h_t, s̃_t) for s̃_t drawn from the prior given h_t, `(B, T)`; None where it was not asked for."""
+
+
+class LogMeanExp:
+    r"""A running :math:`\log \frac1K \sum_k e^{x_k}`: the memory does not grow with K."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.total = torch.tensor(-math.inf, dtype=torch.float64)
+
+    def add(self, value: Tensor) -> None:
+        """Take one more x_k, any shape, the same each time."""
+        self.number += 1
+        self.total = torch.logaddexp(self.total.to(value.device), value)
+
+    def result(self) -> Tensor:
+        """Give the log-mean-exp of what was added."""
+        return self.total - math.log(self.number)
+
+
+def frame_log_prob(model: StateSpaceModel, features: Tensor, target: Tensor) -> Tensor:
+    """Give log p(o | features) in nats, float64, a few frames at a time.
+
+    Args:
+        model: decodes the features.
+        features: `(*, N, F)`.
+        target: the frames, as `Likelihood.target` gives them, `(N, *O)`; each is scored under every leading index.
+
+    Returns:
+        `(*, N)`.
+    """
+    size = max(1, _FRAMES // math.prod(features.shape[:-2]))
+    parts = [
+        model.likelihood.log_prob(model.decode(some).float(), true).double()
+        for some, true in zip(features.split(size, -2), target.split(size), strict=True)
+    ]
+    return torch.cat(parts, -1)  # (*, N)
+
+
+def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, predict: bool) -> Iterator[Trajectory]:
+    """Draw trajectories one after the other, so that the memory is that of one; the encoder runs once.
+
+    Args:
+        model: in eval mode, on the batch's device.
+        batch: B sequences.
+        number: of trajectories.
+        predict: whether to draw the one-step predictions too.
+    """
+    embedding = model.embed(batch.observation)  # (B, T, E)
+    target = model.likelihood.target(batch.observation).flatten(0, 1)  # (B T, *O)
+
+    def log_prob(hidden: Tensor, state: Tensor) -> Tensor:
+        features = torch.cat((hidden, state), -1).flatten(0, 1)  # (B T, H + D)
+        return frame_log_prob(model, features, target).view(batch.mask.shape)  # (B, T)
+
+    for _ in range(number):
+        filtered = model.filter(embedding, batch.action)
+        context = model.prior_context(filtered.hidden)  # (B, T, C)
+        kl = filtered.log_prob - model.prior.log_prob(filtered.state, context)
+        reconstruction = log_prob(filtered.hidden, filtered.state)
+        prediction = log_prob(filtered.hidden, model.prior.rsample(context)[0]) if predict else None
+        yield Trajectory(reconstruction, kl.double(), prediction)
+
+
+@torch.no_grad()
+def score_trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, predict: bool) -> Increments:
+    """Score a batch with K trajectories: `elbo`, `reconstruction`, `kl`, `iwae`, and `pll` where `predict` is set.
+
+    `iwae` is the bound of the first t steps less that of the first t - 1, so its sum is the bound of all.
+    """
+    mask = batch.mask.double()
+    reconstruction, kl = torch.zeros_like(mask), torch.zeros_like(mask)
+    weight, prediction = LogMeanExp(), LogMeanExp()
+    for trajectory in trajectories(model, batch, number, predict):
+        reconstruction += trajectory.reconstruction / number
+        kl += trajectory.kl / number
+        weight.add(((trajectory.reconstruction - trajectory.kl) * mask).cumsum(1))
+        if trajectory.prediction is not None:
+            prediction.add(trajectory.prediction)
+    scores = {
+        "elbo": reconstruction - kl,
+        "reconstruction": reconstruction,
+        "kl": kl,
+        "iwae": weight.result().diff(dim=1, prepend=torch.zeros_like(mask[:, :1])),
+    }
+    if predict:
+        scores["pll"] = prediction.result()
+    return {name: values * mask for name, values in scores.items()}

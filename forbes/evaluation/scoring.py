@@ -1,0 +1,184 @@
+"""Score a model on a whole split, batch by batch: bounded memory, finite numbers only, and resumable."""
+
+import hashlib
+import io
+import shutil
+import sys
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forbes.data import SequenceBatch
+from forbes.errors import ForbesError
+from forbes.evaluation.bounds import Increments, score_trajectories
+from forbes.evaluation.open_loop import score_open_loop
+from forbes.evaluation.smc import score_particles
+from forbes.files import replace_file
+from forbes.models import StateSpaceModel
+from forbes.seeding import derive_seed
+
+__all__ = ["PASSES", "Parts", "Pass", "Scores", "make_pass", "score_split"]
+
+
+class Pass(NamedTuple):
+    """One way through the data, which gives one score or several."""
+
+    metrics: tuple[str, ...]
+    """The scores it is asked for, of those the function gives."""
+    tag: str
+    """Numbers of samples and the like, part of each metric's name."""
+    function: Callable[[StateSpaceModel, SequenceBatch], Increments]
+    batch_size: int
+    """Sequences at a time."""
+
+
+class Scores(NamedTuple):
+    """What a pass found for every sequence, in nats, float64 on the CPU."""
+
+    values: Increments
+    """By metric, what each step adds, 0 on padding, `(N, T)`."""
+    mask: Tensor
+    """True where the step counts, `(N, T)`."""
+
+    @property
+    def steps(self) -> Tensor:
+        """Steps of each sequence without padding, `(N,)`."""
+        return self.mask.sum(1)
+
+
+PASSES = ("elbo", "pll", "fivo", "open-loop")
+_FIVO_ROWS = 16
+"""FIVO holds all particles of a sequence at once: so many rows for each sequence of another pass's batch."""
+
+
+def make_pass(name: str, number: int, batch_size: int, context: int) -> Pass:
+    """Build one of `PASSES`.
+
+    Args:
+        name: elbo (with its parts), pll (and the IWAE of the same trajectories), fivo (with its effective sample
+            size), or open-loop.
+        number: of samples S, particles or futures K.
+        batch_size: sequences at a time.
+        context: c, the steps that the open-loop score shows the model.
+    """
+    if name == "elbo":
+        function = partial(score_trajectories, number=number, predict=False)
+        return Pass(("elbo", "reconstruction", "kl"), f"S={number}", function, batch_size)
+    if name == "pll":
+        function = partial(score_trajectories, number=number, predict=True)
+        return Pass(("iwae", "pll"), f"K={number}", function, batch_size)
+    if name == "fivo":
+        rows = max(1, _FIVO_ROWS * batch_size // number)
+        return Pass(("fivo", "ess"), f"K={number}", partial(score_particles, number=number), rows)
+    metrics, function = ("open_loop", "open_loop_marginal"), partial(score_open_loop, number=number, context=context)
+    return Pass(metrics, f"K={number},c={context}", function, batch_size)
+
+
+class Parts:
+    """Scores of finished batches, one file each, so that an interrupted evaluation goes on where it stopped.
+
+    Args:
+        folder: where to keep them until the evaluation is recorded.
+        key: of all that the scores depend on; another key finds nothing.
+    """
+
+    def __init__(self, folder: Path, *key: object) -> None:
+        self.folder = folder / hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+
+    def read(self, first: int) -> Increments | None:
+        """Give the scores of the batch that begins with this sequence, None if it was not finished."""
+        path = self._path(first)
+        if not path.exists():
+            return None
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: torch.from_numpy(values) for name, values in arrays.items()}
+
+    def write(self, first: int, scores: Increments) -> None:
+        """Keep the scores of a batch."""
+        content = io.BytesIO()
+        np.savez(content, **{name: values.numpy() for name, values in scores.items()})  # type: ignore[arg-type]
+        replace_file(self._path(first), content.getvalue())
+
+    def remove(self) -> None:
+        """Forget them, once the evaluation is recorded."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, first: int) -> Path:
+        return self.folder / f"{first}.npz"
+
+
+def score_split(
+    model: StateSpaceModel,
+    batches: Iterable[tuple[int, SequenceBatch]],
+    score: Pass,
+    seed: int = 0,
+    where: str = "the model",
+    parts: Parts | None = None,
+) -> Scores:
+    """Score every sequence.
+
+    Args:
+        model: in eval mode; its device is where to compute.
+        batches: the index of the first sequence of each batch, and the batch on the CPU.
+        score: what to compute.
+        seed: of the noise, which depends on it and on the batches alone.
+        where: the model's and the split's name, for an error.
+        parts: what an interrupted evaluation has left, and where this one leaves its own.
+
+    Raises:
+        ForbesError: where a score is not finite (it names the sequence), or one sequence needs too much memory.
+    """
+    device = next(model.parameters()).device
+    found: list[Scores] = []
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        for first, batch in batches:
+            values = parts.read(first) if parts else None
+            if values is None:
+                values = _score(model, first, SequenceBatch(*(v.to(device) for v in batch)), score, seed, where)
+                _require_finite(where, first, values)
+                if parts:
+                    parts.write(first, values)
+            found.append(Scores(values, batch.mask))
+    merged = {name: torch.cat([scores.values[name] for scores in found]) for name in score.metrics}  # (N, T)
+    return Scores(merged, torch.cat([scores.mask for scores in found]))
+
+
+def _score(model: StateSpaceModel, first: int, batch: SequenceBatch, score: Pass, seed: int, where: str) -> Increments:
+    """Score a batch; where the memory does not suffice, each half of it."""
+    torch.manual_seed(derive_seed(seed, "evaluation", first))
+    try:
+        scores = score.function(model, batch)
+        return {name: scores[name].cpu() for name in score.metrics}  # (B, T)
+    except RuntimeError as error:
+        if not _out_of_memory(error):
+            raise
+    half = len(batch.mask) // 2
+    if half == 0:
+        raise ForbesError(f"{where}: no memory for one sequence with {score.tag}. Choose fewer particles or samples")
+    print(f"{where}: no memory for {len(batch.mask)} sequences at once, trying {half}", file=sys.stderr, flush=True)
+    parts = [
+        _score(model, first + skip, SequenceBatch(*(values[skip:][:count] for values in batch)), score, seed, where)
+        for skip, count in ((0, half), (half, len(batch.mask) - half))
+    ]
+    return {name: torch.cat([part[name] for part in parts]) for name in score.metrics}
+
+
+def _out_of_memory(error: RuntimeError) -> bool:
+    """Tell whether torch ran out of memory; on the CPU it has no class of its own for that."""
+    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+
+
+def _require_finite(where: str, first: int, scores: Increments) -> None:
+    for name, values in scores.items():
+        broken = torch.nonzero(~values.isfinite().all(1))  # (n, 1)
+        if len(broken):
+            place = int(broken[0])
+            raise ForbesError(
+                f"{where}: the {name} of sequence {first + place} is {values[place].sum().item()}, expected a finite "
+                "number. The training diverged: train again with a smaller learning_rate"
+            )

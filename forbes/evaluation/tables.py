@@ -1,0 +1,65 @@
+"""The tables that `forbes evaluate` prints."""
+
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.measured import Measured, Pair
+
+__all__ = ["print_pairs", "print_runs"]
+
+
+def print_runs(measured: Sequence[Measured]) -> None:
+    """Print every metric of every run."""
+    table = Table(title="scores in nats per sequence, mean ± standard error over sequences; ess as a share of K")
+    for header in ("run", "family"):
+        table.add_column(header, overflow="fold")
+    table.add_column("parameters", justify="right")
+    for name in measured[0].entries:
+        table.add_column(_header(name), justify="right")
+    for one in measured:
+        cells = [
+            f"{entry['per_step']['mean']:.3f}" if "/ess[" in name else str(_estimate(entry))
+            for name, entry in one.entries.items()
+        ]
+        table.add_row(escape(one.run.path), one.run.family, f"{one.run.parameters:,}", *cells)
+    _console().print(table)
+
+
+def print_pairs(pairs: Sequence[Pair]) -> None:
+    """Print the paired difference of every metric of which more is better."""
+    table = Table(title="paired difference over the same sequences, in nats per sequence; (in standard errors)")
+    for header in ("run", "minus"):
+        table.add_column(header, overflow="fold")
+    for name in pairs[0].differences:
+        table.add_column(_header(name), justify="right")
+    for first, second, differences in pairs:
+        cells = [
+            f"{difference.mean:+.2f} ± {difference.standard_error:.2f} ({_ratio(difference)})"
+            for difference in differences.values()
+        ]
+        table.add_row(escape(first.run.path), escape(second.run.path), *cells)
+    _console().print(table)
+
+
+def _console() -> Console:
+    return Console(width=None if sys.stdout.isatty() else 200)  # into a file, rich would fold at 80
+
+
+def _header(name: str) -> str:
+    """Break `test/elbo[bernoulli,S=16]` into short lines."""
+    split, _, metric = name.partition("/")
+    score, _, tag = metric.partition("[")
+    return escape(f"{split}\n{score}\n[{tag}")
+
+
+def _estimate(entry: dict[str, float]) -> Estimate:
+    return Estimate(entry["mean"], entry["standard_error"])
+
+
+def _ratio(difference: Estimate) -> str:
+    return f"{difference.mean / difference.standard_error:+.1f}" if difference.standard_error > 0 else "n/a"

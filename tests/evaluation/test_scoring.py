@@ -1,0 +1,54 @@
+"""Scoring a split where the memory does not suffice."""
+
+import pytest
+import torch
+from torch import nn
+
+from forbes.data import SequenceBatch
+from forbes.errors import ForbesError
+from forbes.evaluation.scoring import Pass, score_split
+
+STEPS = 3
+
+
+def batches():
+    """Two batches of five sequences; the observation is the sequence's number."""
+    for first in (0, 5):
+        number = torch.arange(first, first + 5).view(5, 1, 1).expand(5, STEPS, 1)
+        yield first, SequenceBatch(number, torch.zeros(5, STEPS, 0), torch.zeros(5, STEPS), torch.ones(5, STEPS) > 0)
+
+
+def hungry(limit, error):
+    """A pass that scores a sequence by its number, and has memory for so many at once."""
+
+    def function(model, batch):
+        if len(batch.mask) > limit:
+            raise error
+        return {"number": batch.observation[..., 0].double()}
+
+    return Pass(("number",), "K=9", function, 5)
+
+
+OUT_OF_MEMORY = [
+    torch.OutOfMemoryError("CUDA out of memory"),
+    RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: you tried"),
+]
+
+
+@pytest.mark.parametrize("error", OUT_OF_MEMORY, ids=["cuda", "cpu"])
+@pytest.mark.parametrize("limit", [1, 2, 3, 4])
+def test_a_batch_for_which_the_memory_does_not_suffice_is_halved_loudly(limit, error, capsys):
+    scores = score_split(nn.Linear(1, 1), batches(), hungry(limit, error), where="runs/a, test split")
+
+    torch.testing.assert_close(scores.values["number"].sum(1), STEPS * torch.arange(10, dtype=torch.float64))
+    assert "runs/a, test split: no memory for 5 sequences at once, trying 2" in capsys.readouterr().err
+
+
+def test_a_sequence_that_does_not_fit_alone_is_an_error_with_a_remedy():
+    with pytest.raises(ForbesError, match=r"runs/a: no memory for one sequence with K=9. Choose fewer particles"):
+        score_split(nn.Linear(1, 1), batches(), hungry(0, OUT_OF_MEMORY[0]), where="runs/a")
+
+
+def test_another_error_is_not_taken_for_a_lack_of_memory():
+    with pytest.raises(RuntimeError, match="shapes"):
+        score_split(nn.Linear(1, 1), batches(), hungry(0, RuntimeError("shapes do not fit")))
