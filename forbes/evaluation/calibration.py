@@ -1,0 +1,156 @@
+"""Calibration of a belief from N pairs: a true value, and L samples of the belief that was held about it.
+
+A belief is calibrated where the true value is to its samples as one more of them. Each check turns a pair into a rank
+that is then uniform on 0 … L, whatever the belief (`forbes.evaluation.uniformity` tests that): of the value in each
+dimension (simulation-based calibration, Talts et al., 2018), of its density (expected coverage of the highest-density
+regions, Hermans et al., 2022), of its distance from a random point (TARP, Lemos et al., 2023). Pairs must be
+independent: of a sequence take one step. The classifier two-sample test (Lopez-Paz and Oquab, 2017) compares samples
+with samples.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forbes.errors import ForbesError
+
+__all__ = ["TwoSampleTest", "coverage", "ranks", "tarp_ranks", "two_sample_test"]
+
+
+def ranks(truth: Tensor, samples: Tensor, generator: torch.Generator) -> Tensor:
+    """Count the samples below the true value; of equal ones, a random number counts as below.
+
+    Of values this is simulation-based calibration, a rank for each dimension. Of log-densities log q it is coverage:
+    the true value lies in the highest-density region that holds the share 1 - rank / L of the samples.
+
+    Args:
+        truth: values or log q(truth), `(N, *)`.
+        samples: as many values or log q(sample), `(L, N, *)`.
+        generator: for the ties.
+
+    Returns:
+        Ranks from 0 to L, `(N, *)`, int64.
+    """
+    _require_pairs("ranks", truth, samples)
+    below, equal = (samples < truth).sum(0), (samples == truth).sum(0)  # (N, *), (N, *)
+    chance = torch.rand(equal.shape, generator=generator, dtype=torch.float64, device=truth.device)
+    return below + (chance * (equal + 1)).long()
+
+
+def tarp_ranks(truth: Tensor, samples: Tensor, generator: torch.Generator) -> Tensor:
+    """Rank the true value among the samples by the distance from a point that knows nothing of it (TARP).
+
+    The first sample of each pair is left out of the ranking: it is the point for the next pair, and all of them give
+    the scale of each dimension. So neither depends on what is ranked.
+
+    Args:
+        truth: `(N, D)`.
+        samples: `(L + 1, N, D)`.
+        generator: for the ties.
+
+    Returns:
+        Ranks from 0 to L, `(N,)`, int64; f of the paper is rank / L.
+    """
+    _require_pairs("tarp_ranks", truth, samples)
+    if len(samples) < 2 or len(truth) < 2:
+        raise ForbesError(
+            f"tarp_ranks: {len(truth)} pairs with {len(samples)} samples, expected at least 2 of each. Draw more"
+        )
+    reference = samples[0].roll(1, 0)  # (N, D)
+    scale = _scale(samples[0])  # (D,)
+    distances = [((values - reference) / scale).square().sum(-1) for values in (truth, samples[1:])]  # (N,), (L, N)
+    return ranks(distances[0], distances[1], generator)
+
+
+def coverage(density_ranks: Tensor, samples: int, levels: Tensor) -> Tensor:
+    r"""Measure how often the true value lies in the belief's highest-density regions.
+
+    A region of nominal level a holds the values of which more than 1 - a of the samples have a lower density; between
+    two of the L + 1 steps a rank counts by its share, so the expectation is a at every level for a calibrated belief:
+
+    .. math:: \frac1N \sum_i \mathrm{clip}\big(a (L + 1) - (L - r_i),\, 0,\, 1\big)
+
+    Args:
+        density_ranks: r_i, `ranks` of log q, `(N,)`.
+        samples: L.
+        levels: nominal, in [0, 1], `(A,)`.
+
+    Returns:
+        Shares of the N values, `(A,)`, float64; `binomial_interval(N, levels, 0.95)` is their band.
+    """
+    above = samples - density_ranks  # (N,)
+    return (levels.double()[:, None] * (samples + 1) - above).clamp(0, 1).mean(-1)
+
+
+class TwoSampleTest(NamedTuple):
+    """How well a classifier tells two sets of samples apart."""
+
+    accuracy: float
+    """On samples it was not fitted to; 0.5 where they have one distribution."""
+    p_value: float
+    """Share of random labellings that are told apart as well."""
+
+
+def two_sample_test(
+    first: Tensor, second: Tensor, generator: torch.Generator, folds: int = 5, permutations: int = 199
+) -> TwoSampleTest:
+    """Tell two sets of samples apart by the majority among nearest neighbours (C2ST).
+
+    A sample of one fold is given the label of most of its k nearest neighbours in the other folds, k near the root of
+    their number. Nothing is trained, so labels can be permuted at no cost, and the p-value is exact at any size. It
+    sees missing modes at once, a wrong width worse than the ranks do.
+
+    Args:
+        first: `(N, D)`.
+        second: `(M, D)`; like N, so that 0.5 is what chance gives.
+        generator: of the folds and the permutations.
+        folds: as many parts take their turn.
+        permutations: of the labels.
+    """
+    fit = first.shape[1:] == second.shape[1:] and len(first) + len(second) >= 4 * folds
+    if not (fit and first.isfinite().all() and second.isfinite().all()):
+        raise ForbesError(
+            f"two_sample_test: {tuple(first.shape)} and {tuple(second.shape)}, expected two sets of finite samples, "
+            f"(N, D) and (M, D), {4 * folds} together. Look at how they were drawn"
+        )
+    values = torch.cat((first, second)).double()  # (N + M, D)
+    values = values / _scale(values)
+    order = torch.randperm(len(values), generator=generator)
+    neighbours = torch.empty(len(values), _neighbours(len(values), folds), dtype=torch.long)  # (N + M, K)
+    for fold in order.chunk(folds):
+        others = order[~torch.isin(order, fold)]
+        nearest = torch.cdist(values[fold], values[others]).topk(neighbours.shape[1], largest=False).indices
+        neighbours[fold] = others[nearest]  # (F, K)
+    label = torch.arange(len(values)) >= len(first)  # (N + M,)
+    accuracy = _accuracy(label, neighbours)
+    drawn = [_accuracy(label[torch.randperm(len(label), generator=generator)], neighbours) for _ in range(permutations)]
+    as_good = sum(other >= accuracy for other in drawn)
+    return TwoSampleTest(accuracy, (1 + as_good) / (1 + permutations))
+
+
+def _neighbours(count: int, folds: int) -> int:
+    """Give the odd number, at most the root of the number of samples in the other folds: no vote is a tie."""
+    return (math.isqrt(count - math.ceil(count / folds)) - 1) // 2 * 2 + 1
+
+
+def _accuracy(label: Tensor, neighbours: Tensor) -> float:
+    votes = label[neighbours].double().mean(1)  # (N + M,)
+    return ((votes > 0.5) == label).double().mean().item()
+
+
+def _scale(values: Tensor) -> Tensor:
+    """Give the standard deviation of each dimension, `(N, D)` to `(D,)`; 1 where there is none."""
+    deviation = values.std(0)
+    return torch.where(deviation > 0, deviation, 1)
+
+
+def _require_pairs(where: str, truth: Tensor, samples: Tensor) -> None:
+    if samples.shape[1:] != truth.shape:
+        raise ForbesError(
+            f"{where}: {tuple(samples.shape)} samples for {tuple(truth.shape)} true values, expected (L, N, ...) for "
+            "(N, ...). Draw the samples of all pairs along the first dimension"
+        )
+    if truth.isnan().any() or samples.isnan().any():
+        raise ForbesError(f"{where}: there are NaN, expected numbers. Look for the step at which the belief diverged")
