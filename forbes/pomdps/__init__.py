@@ -1,0 +1,29 @@
+"""Partially observable processes whose belief is known exactly, one file each, all through `Process`."""
+
+from forbes.pomdps.base import AffineGaussian, ExactFilter, Process, Trajectories
+from forbes.pomdps.beliefs import CategoricalBelief, ExactBelief, GaussianMixtureBelief, GridBelief
+from forbes.pomdps.light_dark import LightDark
+from forbes.pomdps.linear_gaussian import LinearGaussian
+from forbes.pomdps.mirror_sensor import MirrorSensor
+from forbes.pomdps.mountain_hike import MountainHike
+from forbes.pomdps.t_maze import TMaze
+from forbes.pomdps.tiger import Tiger
+from forbes.pomdps.ungm import Ungm
+
+__all__ = [
+    "AffineGaussian",
+    "CategoricalBelief",
+    "ExactBelief",
+    "ExactFilter",
+    "GaussianMixtureBelief",
+    "GridBelief",
+    "LightDark",
+    "LinearGaussian",
+    "MirrorSensor",
+    "MountainHike",
+    "Process",
+    "TMaze",
+    "Tiger",
+    "Trajectories",
+    "Ungm",
+]

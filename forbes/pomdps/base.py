@@ -1,0 +1,187 @@
+r"""The interface of every process: it samples itself, gives its own densities, and its belief is known exactly.
+
+.. math:: s_1 \sim p(s), \qquad s_t \sim p(s \mid s_{t-1}, a_{t-1}), \qquad o_t \sim p(o \mid s_t)
+"""
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forbes.errors import ForbesError
+from forbes.pomdps.beliefs import ExactBelief, GaussianMixtureBelief
+from forbes.pomdps.distributions import Distribution
+
+__all__ = ["AffineGaussian", "ExactFilter", "Process", "Trajectories", "require_positive"]
+
+
+class Trajectories(NamedTuple):
+    """Sequences of a process in float64. Index t holds (s_t, o_t, a_{t-1}): the action that led there, 0 at the start.
+
+    An example of three steps, where a1 leads from s1 to s2::
+
+        state        s1  s2  s3
+        observation  o1  o2  o3
+        action       0   a1  a2
+    """
+
+    state: Tensor
+    """s_t, `(B, T, D)`."""
+    observation: Tensor
+    """o_t, `(B, T, O)`."""
+    action: Tensor
+    """a_{t-1}, `(B, T, A)`; A may be 0."""
+
+
+class ExactFilter(NamedTuple):
+    """What one exact pass over the observations gives."""
+
+    belief: ExactBelief
+    """p(s_t | o_1:t, a_1:t-1), one for each sequence and step, `(B, T)`."""
+    step_log_likelihood: Tensor
+    """log p(o_t | o_1:t-1, a_1:t-1) in nats, `(B, T)`: the most that a prequential score can reach in expectation."""
+
+    @property
+    def log_likelihood(self) -> Tensor:
+        """Sum them to log p(o_1:T | a_1:T-1) in nats, `(B,)`."""
+        return self.step_log_likelihood.sum(1)
+
+
+class AffineGaussian(NamedTuple):
+    r"""A Gaussian whose mean is affine in the state before: :math:`p(s_t \mid s_{t-1}) = N(G_t s_{t-1} + g_t, C_t)`."""
+
+    gain: Tensor
+    """G_t, `(T, D, D)`; zero at the start, where no state comes before."""
+    offset: Tensor
+    """g_t, `(B, T, D)`."""
+    covariance: Tensor
+    """C_t, `(T, D, D)`."""
+
+    def at(self, time: int, previous: Tensor) -> GaussianMixtureBelief:
+        """Give the Gaussian of s_t at index `time` (from 0), given s_{t-1} of shape `(..., B, D)`."""
+        mean = previous @ self.gain[time].T + self.offset[:, time]  # (..., B, D)
+        return GaussianMixtureBelief(mean.new_zeros(*mean.shape[:-1], 1), mean.unsqueeze(-2), self.covariance[time])
+
+
+class Process(ABC):
+    """A partially observable process whose belief is known exactly.
+
+    To add one, copy the file that is most like it: `linear_gaussian.py` (Kalman), `mirror_sensor.py` (grid) or
+    `tiger.py` (finite). It has three dimensions and says how it starts, moves, is seen and is acted on; sampling and
+    densities follow from these. Finite states, observations and actions are one-hot vectors.
+
+    An action never depends on the state, so nothing is learned about the state from it.
+    """
+
+    state_dim: int
+    """D."""
+    observation_dim: int
+    """O."""
+    action_dim: int
+    """A, 0 for a process without actions."""
+
+    @abstractmethod
+    def initial(self, like: Tensor) -> Distribution:
+        """Give p(s_1), in the dtype and on the device of `like`."""
+
+    @abstractmethod
+    def transition(self, state: Tensor, action: Tensor) -> Distribution:
+        """Give p(s_t | s_{t-1}, a_{t-1}) for `(*, D)` and `(*, A)`, which broadcast."""
+
+    @abstractmethod
+    def emission(self, state: Tensor) -> Distribution:
+        """Give p(o_t | s_t) for `(*, D)`."""
+
+    @abstractmethod
+    def policy(self, sequences: int, steps: int, generator: torch.Generator) -> Tensor:
+        """Draw a_1, a_2, … of `sample`, blind to everything else: float64 `(B, steps, A)`."""
+
+    @abstractmethod
+    def exact_filter(self, observation: Tensor, action: Tensor) -> ExactFilter:
+        """Compute the belief and the evidence of every step, in float64 on the CPU.
+
+        Args:
+            observation: o_t, `(B, T, O)`.
+            action: a_{t-1}, zero at the first step, `(B, T, A)`.
+
+        Raises:
+            ForbesError: where a shape or a value is not what the process can produce (`checked`).
+        """
+
+    def exact_smoothing_conditional(self, observation: Tensor, action: Tensor) -> AffineGaussian | None:
+        r"""Compute :math:`p(s_t \mid s_{t-1}, a, o_{t:T})`, in float64 on the CPU, where it is Gaussian, else None.
+
+        The product over t is the posterior of the whole path: the optimal proposal, whose weights are all p(o).
+        """
+        return None
+
+    def log_likelihood(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Give log p(o_1:T | a_1:T-1) in nats, `(B,)`."""
+        return self.exact_filter(observation, action).log_likelihood
+
+    def log_initial(self, state: Tensor) -> Tensor:
+        """Give log p(s_1) in nats: `(*, D)` to `(*)`."""
+        return self.initial(state).log_prob(state)
+
+    def log_transition(self, next_state: Tensor, state: Tensor, action: Tensor) -> Tensor:
+        """Give log p(s_t | s_{t-1}, a_{t-1}) in nats: `(*, D)`, `(*, D)` and `(*, A)`, which broadcast, to `(*)`."""
+        return self.transition(state, action).log_prob(next_state)
+
+    def log_observation(self, observation: Tensor, state: Tensor) -> Tensor:
+        """Give log p(o_t | s_t) in nats: `(*, O)` and `(*, D)`, which broadcast, to `(*)`."""
+        return self.emission(state).log_prob(observation)
+
+    def sample(self, sequences: int, length: int, generator: torch.Generator) -> Trajectories:
+        """Draw B sequences of T steps under `policy`: a pure function of the generator's state.
+
+        Raises:
+            ForbesError: when there is not at least one sequence of one step.
+        """
+        require_positive(type(self).__name__, sequences=sequences, length=length)
+        start = torch.zeros(sequences, 1, self.action_dim, dtype=torch.float64)
+        policy = self.policy(sequences, length, generator)  # a_1, ..., a_T, whose last leads nowhere, (B, T, A)
+        action = torch.cat((start, policy[:, :-1]), 1)  # (B, T, A)
+        state = self.initial(start).sample(sequences, generator)  # (B, D)
+        states = [state]
+        for led_here in action.unbind(1)[1:]:
+            state = self.transition(state, led_here).sample(1, generator).squeeze(0)  # (B, D)
+            states.append(state)
+        path = torch.stack(states, 1)  # (B, T, D)
+        return Trajectories(path, self.emission(path).sample(1, generator).squeeze(0), action)
+
+    def checked(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Give both in float64 on the CPU, or say in one sentence what is wrong with them."""
+        where = type(self).__name__
+        _require_sequences(f"{where}: the observation", observation, self.observation_dim)
+        _require_sequences(f"{where}: the action", action, self.action_dim)
+        if observation.shape[:2] != action.shape[:2]:
+            shapes = f"{tuple(observation.shape[:2])} and {tuple(action.shape[:2])}"
+            raise ForbesError(
+                f"{where}: (B, T) of observation and action are {shapes}, expected the same. Cut both alike"
+            )
+        if action[:, 0].any():
+            raise ForbesError(
+                f"{where}: the first action is not zero, expected at index t the action that led to the observation. "
+                "Shift the actions by one step"
+            )
+        return observation.double().cpu(), action.double().cpu()
+
+
+def _require_sequences(where: str, values: Tensor, dim: int) -> None:
+    if values.dim() != 3 or values.shape[-1] != dim or values.shape[1] < 1:
+        shape = tuple(values.shape)
+        raise ForbesError(f"{where} has shape {shape}, expected (B, T, {dim}), T at least 1. Reshape it")
+    if len(bad := torch.nonzero(~values.isfinite())):
+        sequence, step, _ = bad[0].tolist()
+        value = values[tuple(bad[0])].item()
+        raise ForbesError(
+            f"{where} of sequence {sequence} at step {step} is {value}, expected finite numbers. Leave the sequence out"
+        )
+
+
+def require_positive(where: str, **numbers: float) -> None:
+    """Raise a ForbesError unless every number is above 0."""
+    for name, number in numbers.items():
+        if not number > 0:
+            raise ForbesError(f"{where}: {name} is {number}, expected more than 0. Choose another")

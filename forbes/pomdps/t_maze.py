@@ -1,0 +1,68 @@
+"""The T-maze: a sign seen at the start says which way to turn at the end."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from forbes.errors import ForbesError
+from forbes.pomdps.base import require_positive
+from forbes.pomdps.hmm import FiniteProcess
+
+__all__ = ["TMaze"]
+
+RIGHT, UP, LEFT, DOWN = range(4)
+SIGN_UP, SIGN_DOWN, CORRIDOR, CROSSROAD = range(4)
+
+
+class TMaze(FiniteProcess):
+    r"""A corridor of L steps that ends at a crossroad.
+
+    Its places, and what is seen at them::
+
+                        |L + 1|     the goal is up or down, as the sign at 0 says;
+        |0|.|.|.|.|.|.|.|  L  |     what is seen: sign up, sign down, corridor,
+                        |L + 2|     or (at L and behind it) crossroad
+
+    With probability :math:`\lambda` an action is replaced by one of the four at random; one that leads into a wall
+    has no effect, and L + 1 and L + 2 are never left. Bakker (2001); numbers, observations and policy as in Lambrechts
+    et al. (2022, arXiv 2208.03520, `tmaze.py` of *belief-rnn*). Rewards are left out.
+
+    State i is at place i mod (L + 3), with the goal up for i < L + 3; actions are right, up, left, down. Those of
+    `sample` go right with probability 1/2.
+
+    Args:
+        length: L.
+        stochasticity: :math:`\lambda` in [0, 1]; 0.2 is the other published setting.
+    """
+
+    def __init__(self, length: int = 10, stochasticity: float = 0.0) -> None:
+        require_positive("TMaze", length=length)
+        if not 0 <= stochasticity <= 1:
+            raise ForbesError(f"TMaze: stochasticity is {stochasticity}, expected a probability. Choose one in [0, 1]")
+        places = length + 3
+        walk = torch.stack([one_hot(next_place(length, action), places).double() for action in range(4)])  # (4, P, P)
+        walk = (1 - stochasticity) * walk + stochasticity * walk.mean(0)
+        seen = torch.full((2, places), CORRIDOR)
+        seen[:, 0] = torch.tensor([SIGN_UP, SIGN_DOWN])
+        seen[:, length:] = CROSSROAD
+        start = torch.zeros(2, places, dtype=torch.float64)
+        start[:, 0] = 0.5
+        super().__init__(
+            initial=start.flatten(),  # (2 P,)
+            transition=torch.stack([torch.block_diag(each, each) for each in walk]),  # (4, 2 P, 2 P)
+            emission=one_hot(seen.flatten(), 4).double(),  # (2 P, 4)
+            policy=torch.tensor([3.0, 1.0, 1.0, 1.0], dtype=torch.float64) / 6,
+        )
+
+
+def next_place(length: int, action: int) -> Tensor:
+    """Give the place that an action leads to from each of the L + 3, int64."""
+    place = torch.arange(length + 3)
+    after = place.clone()
+    if action == RIGHT:
+        after[:length] += 1
+    elif action == LEFT:
+        after[1 : length + 1] -= 1
+    else:
+        after[length] += 1 if action == UP else 2
+    return after

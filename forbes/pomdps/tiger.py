@@ -1,0 +1,45 @@
+"""The tiger problem: listen at two doors, behind one of which is a tiger."""
+
+import torch
+
+from forbes.errors import ForbesError
+from forbes.pomdps.hmm import FiniteProcess
+
+__all__ = ["Tiger"]
+
+LISTEN, OPEN_LEFT, OPEN_RIGHT = range(3)
+
+
+class Tiger(FiniteProcess):
+    r"""A tiger behind the left or the right door; listening tells which with probability p.
+
+    Opening a door puts the tiger behind a door at random, and what is heard then says nothing. Kaelbling, Littman and
+    Cassandra (1998); p = 0.85. Rewards are left out.
+
+    There, what is heard depends on the action. Here the state remembers whether it was listening, so that it depends
+    on the state alone: (left, heard), (right, heard), (left, not heard), (right, not heard). Nothing is heard before
+    the first action. After l times "left" and r times "right" since the last opening:
+
+    .. math:: P(\text{left}) = \frac{1}{1 + ((1 - p) / p)^{\,l - r}}
+
+    Actions are listen, open left, open right; those of `sample` listen with probability 0.8.
+
+    Args:
+        accuracy: p.
+    """
+
+    def __init__(self, accuracy: float = 0.85) -> None:
+        if not 0 <= accuracy <= 1:
+            raise ForbesError(f"Tiger: accuracy is {accuracy}, expected a probability. Choose one in [0, 1]")
+        stays = torch.eye(2, dtype=torch.float64)
+        anywhere = torch.full((2, 2), 0.5, dtype=torch.float64)
+        nowhere = torch.zeros(2, 2, dtype=torch.float64)
+        listened = torch.cat((stays, nowhere), 1).repeat(2, 1)  # (4, 4), to the states that heard
+        opened = torch.cat((nowhere, anywhere), 1).repeat(2, 1)  # (4, 4)
+        heard = accuracy * stays + (1 - accuracy) * (1 - stays)  # (2, 2)
+        super().__init__(
+            initial=torch.tensor([0.0, 0.0, 0.5, 0.5], dtype=torch.float64),
+            transition=torch.stack((listened, opened, opened)),  # (3, 4, 4)
+            emission=torch.cat((heard, anywhere)),  # (4, 2)
+            policy=torch.tensor([0.8, 0.1, 0.1], dtype=torch.float64),
+        )
