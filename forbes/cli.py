@@ -28,6 +28,9 @@ COMMANDS = {
     "predict": Command("run the prediction loop of a model", _TRAINED, "forbes.training.commands:predict"),
     "evaluate": Command("measure trained models and compare them", "RUN RUN", "forbes.evaluation.commands:main"),
     "theorem": Command("check Theorem 1 in closed form", "--steps 30", "forbes.evaluation.theorem_command:main"),
+    "calibrate": Command(
+        "check a filter against its own model", "RUN -o figures", "forbes.figures.calibrate_command:main"
+    ),
     "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.figures.commands:main"),
     "data": Command("fetch, build and look at data", "show strokes -o strokes.png", "forbes.data.commands:main"),
     "doctor": Command("say what this machine has and lacks", "", "forbes.doctor:main"),

@@ -1,7 +1,8 @@
 """Data: one DataModule, several sources of sequences."""
 
 from forbes.data.datamodule import SequenceDataModule
+from forbes.data.simulated import Simulated
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.strokes import Strokes
 
-__all__ = ["SequenceBatch", "SequenceDataModule", "SequenceSource", "Split", "Strokes"]
+__all__ = ["SequenceBatch", "SequenceDataModule", "SequenceSource", "Simulated", "Split", "Strokes"]

@@ -14,7 +14,7 @@ class SequenceBatch(NamedTuple):
     """Sequences, batch first. Index t holds (o_t, a_{t-1}, r_t): the action that led to o_t, zero at the start."""
 
     observation: Tensor
-    """o_t, uint8 (B, T, C, H, W) for images."""
+    """o_t, uint8 (B, T, C, H, W) for images, float32 (B, T, O) for vectors."""
     action: Tensor
     """a_{t-1}, float32 (B, T, A); A may be 0."""
     reward: Tensor

@@ -15,12 +15,12 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from forbes.arguments import ArgumentParser, positive
-from forbes.data import SequenceBatch, Split
+from forbes.data import SequenceBatch, Simulated, Split
 from forbes.errors import ForbesError
 from forbes.evaluation.measured import Measured, pair
-from forbes.evaluation.record import describe, metric_name, read_record, write_record
+from forbes.evaluation.record import describe, read_record, write_record
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, split_batches
-from forbes.evaluation.scoring import PASSES, Parts, Pass, make_pass, score_split
+from forbes.evaluation.scoring import PASSES, Parts, Pass, exact_pass, make_pass, score_split
 from forbes.evaluation.tables import print_pairs, print_runs
 from forbes.training.provenance import commit
 from forbes.training.run_folder import RunFolder
@@ -45,7 +45,7 @@ certain. So beside it:
   fivo       the sequential Monte-Carlo bound, by K particles, and their effective sample size
   open-loop  log p(rest | beginning), by K futures that start in the belief
 
-The last three take the first {_SUBSET} sequences, and their names say so. Writes evaluation.json, and evaluation.npz
+Data of a known process add log_p, the exact log p(o_1..T), which no bound exceeds. The last three take the first {_SUBSET} sequences, and their names say so. Writes evaluation.json, and evaluation.npz
 with each sequence's scores, into each run folder. Interrupted, the same command goes on where it stopped."""
 
 
@@ -123,16 +123,21 @@ def _device(name: str) -> str:
 def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
     """Say which passes to make, on how many sequences; refuse runs that cannot be compared there."""
     numbers = {"elbo": args.samples, "pll": args.particles, "fivo": args.particles, "open-loop": args.futures}
+    wanted = {
+        name: make_pass(name, numbers[name], args.batch_size, args.context) for name in PASSES if name in args.scores
+    }
+    if isinstance(source := runs[0].data.source, Simulated):
+        wanted = {"exact": exact_pass(source.process)} | wanted
     hashes: dict[int, list[str]] = {}
     jobs = []
-    for name in (name for name in PASSES if name in args.scores):
-        count = _count(runs[0], args, _SUBSET if name != "elbo" else sys.maxsize)
+    for name, score in wanted.items():
+        count = _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else _SUBSET)
         if count not in hashes:
             for run in runs:
                 _count(run, args, count)
             hashes[count] = [data_sha256(run.data, args.split, count) for run in runs]
             require_comparable(runs, hashes[count])
-        jobs.append(_Job(name, make_pass(name, numbers[name], args.batch_size, args.context), count, hashes[count]))
+        jobs.append(_Job(name, score, count, hashes[count]))
     length = runs[0].data.length
     if "open-loop" in args.scores and args.context >= length:
         raise ForbesError(
@@ -167,7 +172,8 @@ def _measure(one: Measured, job: _Job, sha256: str, args: Any) -> Parts:
     batches = _progress(batches, f"{run.path} {job.name}", job.sequences)
     scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts)
     for metric in score.metrics:
-        name = metric_name(split, metric, run.model.likelihood.name, score.tag)
+        tag = score.tag if job.name == "exact" else f"{run.model.likelihood.name},{score.tag}"
+        name = f"{split}/{metric}[{tag}]"
         one.totals[name] = scores.values[metric].sum(1)  # (N,)
         one.entries[name] = describe(scores, metric) | {
             "data": {"name": data_name(run.data), "sha256": sha256},

@@ -18,12 +18,7 @@ from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.scoring import Scores
 from forbes.files import replace_file
 
-__all__ = ["describe", "metric_name", "read_record", "write_record"]
-
-
-def metric_name(split: str, metric: str, likelihood: str, tag: str) -> str:
-    """Name a metric: `test/elbo[bernoulli,S=16]`."""
-    return f"{split}/{metric}[{likelihood},{tag}]"
+__all__ = ["describe", "read_record", "write_record"]
 
 
 def describe(scores: Scores, metric: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Trained runs that are looked at together: what each is, and whether their numbers may be compared."""
 
 import hashlib
+import inspect
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -72,10 +73,8 @@ def split_batches(
 
 def data_name(data: SequenceDataModule) -> str:
     """Say what data these are: the source with its arguments, and the length."""
-    arguments = {
-        key: value for key, value in vars(data.source).items() if not key.startswith("_") and value is not None
-    }
-    listed = ", ".join(f"{key}={value}" for key, value in arguments.items())
+    values = {name: getattr(data.source, name) for name in inspect.signature(type(data.source)).parameters}
+    listed = ", ".join(f"{name}={value}" for name, value in values.items() if value is not None)
     return f"{type(data.source).__name__}({listed}), {data.length} steps"
 
 

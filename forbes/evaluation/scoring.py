@@ -20,9 +20,10 @@ from forbes.evaluation.open_loop import score_open_loop
 from forbes.evaluation.smc import score_particles
 from forbes.files import replace_file
 from forbes.models import StateSpaceModel
+from forbes.pomdps import Process
 from forbes.seeding import derive_seed
 
-__all__ = ["PASSES", "Parts", "Pass", "Scores", "make_pass", "score_split"]
+__all__ = ["PASSES", "Parts", "Pass", "Scores", "exact_pass", "make_pass", "score_split"]
 
 
 class Pass(NamedTuple):
@@ -77,6 +78,21 @@ def make_pass(name: str, number: int, batch_size: int, context: int) -> Pass:
         return Pass(("fivo", "ess"), f"K={number}", partial(score_particles, number=number), rows)
     metrics, function = ("open_loop", "open_loop_marginal"), partial(score_open_loop, number=number, context=context)
     return Pass(metrics, f"K={number},c={context}", function, batch_size)
+
+
+_EXACT_ROWS = 20  # sequences; a belief on a fine grid is 3 MB each
+
+
+def exact_pass(process: Process) -> Pass:
+    """Build the pass that asks the process itself: `log_p`, the sum of its one-step predictive log-likelihoods.
+
+    No bound is above it, and no belief has a higher prequential score in expectation.
+    """
+
+    def function(model: StateSpaceModel, batch: SequenceBatch) -> Increments:
+        return {"log_p": process.exact_filter(batch.observation, batch.action).step_log_likelihood}
+
+    return Pass(("log_p",), "exact", function, _EXACT_ROWS)
 
 
 class Parts:

@@ -3,10 +3,12 @@
 import math
 from abc import ABC, abstractmethod
 
+import torch
 from torch import Tensor
-from torch.nn.functional import softplus
+from torch.distributions import Categorical
+from torch.nn.functional import log_softmax, one_hot, softplus
 
-__all__ = ["Bernoulli", "Likelihood", "Normal"]
+__all__ = ["Bernoulli", "Likelihood", "Normal", "OneHot", "VectorNormal"]
 
 
 class Likelihood(ABC):
@@ -16,15 +18,19 @@ class Likelihood(ABC):
 
     @abstractmethod
     def target(self, observation: Tensor) -> Tensor:
-        """Scale a stored observation (uint8) to the values the encoder reads and the density is about, float32."""
+        """Turn a stored observation into the values the encoder reads and the density is about, float32."""
 
     @abstractmethod
     def mean(self, output: Tensor) -> Tensor:
-        """Give E[o | output] as a grey value in [0, 1], for pictures; shape of `output`."""
+        """Give E[o | output], for pictures as a grey value in [0, 1]; shape of `output`."""
+
+    @abstractmethod
+    def sample(self, output: Tensor) -> Tensor:
+        """Draw an observation as `target` would give it; shape of `output`."""
 
     @abstractmethod
     def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
-        """Give log p(target | output) in nats, summed over the three image dimensions: `(*, C, H, W)` to `(*)`."""
+        """Give log p(target | output) in nats of whole observations: images `(*, C, H, W)` or vectors `(*, O)`, to `(*)`."""
 
 
 class Bernoulli(Likelihood):
@@ -39,6 +45,10 @@ class Bernoulli(Likelihood):
     def mean(self, output: Tensor) -> Tensor:
         """See `Likelihood.mean`."""
         return output.sigmoid()
+
+    def sample(self, output: Tensor) -> Tensor:
+        """See `Likelihood.sample`."""
+        return output.sigmoid().bernoulli()
 
     def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
         """See `Likelihood.log_prob`."""
@@ -66,8 +76,68 @@ class Normal(Likelihood):
         """See `Likelihood.mean`."""
         return (output + 0.5).clamp(0, 1)
 
+    def sample(self, output: Tensor) -> Tensor:
+        """See `Likelihood.sample`."""
+        return output + self.std * torch.randn_like(output)
+
     def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
         """See `Likelihood.log_prob`."""
-        constant = math.log(self.std) + 0.5 * math.log(2 * math.pi)
-        error = ((target - output) / self.std).square().sum((-3, -2, -1))
-        return -0.5 * error - constant * math.prod(target.shape[-3:])
+        return _normal(output, target, self.std, (-3, -2, -1))
+
+
+class VectorNormal(Likelihood):
+    r"""Vectors of numbers, each of fixed spread: :math:`N(x;\, output,\, \sigma^2)`.
+
+    Args:
+        std: :math:`\sigma`; the sensor's, where it is known.
+    """
+
+    def __init__(self, std: float = 1.0) -> None:
+        self.std = std
+        self.name = f"normal({std:g})"
+
+    def target(self, observation: Tensor) -> Tensor:
+        """See `Likelihood.target`: as they are."""
+        return observation.float()
+
+    def mean(self, output: Tensor) -> Tensor:
+        """See `Likelihood.mean`."""
+        return output
+
+    def sample(self, output: Tensor) -> Tensor:
+        """See `Likelihood.sample`."""
+        return output + self.std * torch.randn_like(output)
+
+    def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
+        """See `Likelihood.log_prob`."""
+        return _normal(output, target, self.std, (-1,))
+
+
+class OneHot(Likelihood):
+    r"""One of O symbols as a one-hot vector, with the output u as logits: :math:`\log p(x) = \log softmax(u)_x`."""
+
+    name = "categorical"
+
+    def target(self, observation: Tensor) -> Tensor:
+        """See `Likelihood.target`: as they are."""
+        return observation.float()
+
+    def mean(self, output: Tensor) -> Tensor:
+        """See `Likelihood.mean`: the probabilities."""
+        return output.softmax(-1)
+
+    def sample(self, output: Tensor) -> Tensor:
+        """See `Likelihood.sample`."""
+        symbol = Categorical(logits=output).sample()  # (*)
+        return one_hot(symbol, output.shape[-1]).to(output.dtype)  # (*, O)
+
+    def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
+        """See `Likelihood.log_prob`."""
+        return (target * log_softmax(output, -1)).sum(-1)
+
+
+def _normal(mean: Tensor, value: Tensor, std: float, dims: tuple[int, ...]) -> Tensor:
+    """Give log N(value; mean, std²) in nats, summed over the last dimensions."""
+    constant = math.log(std) + 0.5 * math.log(2 * math.pi)
+    error = ((value - mean) / std).square().sum(dims)
+    return -0.5 * error - constant * math.prod(value.shape[-len(dims) :])

@@ -41,7 +41,7 @@ def bind_gru(cell: nn.GRUCell, loop: Loop) -> Callable[[Tensor, Tensor], Tensor]
 
 
 class Encoder(nn.Module):
-    """e_t = encoder(o_t): images `(N, C, H, W)` to embeddings `(N, E)`.
+    """e_t = encoder(o_t): images `(N, C, H, W)`, or vectors `(N, O)`, to embeddings `(N, E)`.
 
     Attributes:
         embedding_dim: E.
@@ -51,7 +51,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Features `(N, F)` to the likelihood's parameters `(N, C, H, W)`."""
+    """Features `(N, F)` to the likelihood's parameters, in the observation's shape."""
 
 
 EncoderFamily: TypeAlias = Callable[[tuple[int, ...]], Encoder]
@@ -61,10 +61,10 @@ DecoderFamily: TypeAlias = Callable[[int, tuple[int, ...]], Decoder]
 
 
 class MLPEncoder(Encoder):
-    """Perceptron on flattened pixels: by far the cheapest encoder of small frames on a CPU.
+    """Perceptron on vectors or flattened pixels: by far the cheapest encoder of small frames on a CPU.
 
     Args:
-        observation_shape: (C, H, W).
+        observation_shape: (C, H, W), or (O,).
         width: width of each layer, and E.
         layers: how many.
     """
@@ -81,11 +81,11 @@ class MLPEncoder(Encoder):
 
 
 class MLPDecoder(Decoder):
-    """Perceptron to pixels.
+    """Perceptron to vectors or pixels.
 
     Args:
         feature_dim: F.
-        observation_shape: (C, H, W).
+        observation_shape: (C, H, W), or (O,).
         width: width of each hidden layer.
         layers: how many hidden layers.
         output_bias: the output it starts from; the logit of the mean pixel, -4 for strokes, saves the first thousand
@@ -110,7 +110,7 @@ class MLPDecoder(Decoder):
     def forward(self, features: Tensor) -> Tensor:
         """See `Decoder`."""
         output: Tensor = self.net(features)
-        return output.view(-1, *self.observation_shape)  # (N, C, H, W)
+        return output.view(-1, *self.observation_shape)  # (N, *O)
 
 
 class ConvEncoder(Encoder):

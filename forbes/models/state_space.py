@@ -114,9 +114,13 @@ class StateSpaceModel(nn.Module):
         return State(weight.new_zeros(batch, self.hidden_dim), weight.new_zeros(batch, self.state_dim))
 
     def embed(self, observation: Tensor) -> Tensor:
-        """Encode every frame: stored observations `(B, T, C, H, W)` to e `(B, T, E)`."""
-        embedding: Tensor = self.encoder(self.likelihood.target(observation).flatten(0, 1))  # (B T, E)
-        return embedding.view(*observation.shape[:2], -1)  # (B, T, E)
+        """Encode every frame: stored observations `(B, T, *O)` to e `(B, T, E)`."""
+        return self.encode(self.likelihood.target(observation))
+
+    def encode(self, target: Tensor) -> Tensor:
+        """Encode every frame as `Likelihood.target` or `Likelihood.sample` gives it: `(B, T, *O)` to e `(B, T, E)`."""
+        embedding: Tensor = self.encoder(target.flatten(0, 1))  # (B T, E)
+        return embedding.view(*target.shape[:2], -1)  # (B, T, E)
 
     def filter(self, embedding: Tensor, action: Tensor, start: State | None = None) -> Filtered:
         """Run the posterior along a sequence.
@@ -176,9 +180,9 @@ class StateSpaceModel(nn.Module):
         return State(hidden.flatten(0, 1), state.flatten(0, 1))  # (N B, H), (N B, D)
 
     def decode(self, features: Tensor) -> Tensor:
-        """Give the likelihood's parameters: features `(*, H + D)` to `(*, C, H, W)`."""
-        output: Tensor = self.decoder(features.flatten(0, -2))  # (N, C, H, W)
-        return output.view(*features.shape[:-1], *output.shape[1:])  # (*, C, H, W)
+        """Give the likelihood's parameters: features `(*, H + D)` to `(*, *O)`."""
+        output: Tensor = self.decoder(features.flatten(0, -2))  # (N, *O)
+        return output.view(*features.shape[:-1], *output.shape[1:])  # (*, *O)
 
     def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
         """Estimate the bound with one posterior trajectory per sequence; arguments as in `SequenceBatch`."""

@@ -3,6 +3,7 @@
 import json
 import shutil
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,6 +106,29 @@ def test_every_score_is_measured_by_default_and_named_with_its_numbers(runs, cap
     assert not any(entries["test[:5]/open_loop[bernoulli,K=4,c=2]"]["curve"][:2])
     out = capsys.readouterr().out
     assert all(name in out for name in ("elbo", "iwae", "pll", "fivo", "open_loop", "[bernoulli,K=4,c=2]"))
+
+
+def test_data_of_a_known_process_add_its_exact_likelihood(tmp_path, capsys):
+    config = Path(__file__).parents[2] / "configs" / "pomdp" / "linear_gaussian" / "rssm.yaml"
+    small = [
+        "--data.updates_per_epoch=1",
+        "--trainer.max_epochs=1",
+        "--trainer.log_every_n_steps=1",
+        "--data.source.init_args.test=40",
+    ]
+    run = fit(config, tmp_path / "run", *small)
+
+    assert main(["evaluate", str(run), "--particles", "3", "--futures", "3", "--context", "5"]) == 0
+
+    source = load_runs([str(run)])[0].data.source
+    drawn = source.trajectories("test", 15)
+    exact = source.process.log_likelihood(drawn.observation.float(), drawn.action)
+    np.testing.assert_allclose(arrays_of(run)["test/log_p[exact]"], exact.numpy())
+    scores = {name: entry["mean"] for name, entry in record(run).items()}
+    bounds = [name for name in scores if name.startswith(("test/elbo[", "test/iwae[", "test/pll[", "test/fivo["))]
+    assert len(bounds) == 4
+    assert all(scores[name] < scores["test/log_p[exact]"] for name in bounds)  # nothing was learned yet
+    assert "log_p" in capsys.readouterr().out
 
 
 def test_both_runs_record_the_same_paired_difference(runs, capsys):

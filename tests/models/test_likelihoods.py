@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import distributions
 
-from forbes.models import Bernoulli, Normal
+from forbes.models import Bernoulli, Normal, OneHot, VectorNormal
 
 SHAPE = (5, 3, 2, 4, 4)  # (B, T, C, H, W)
 
@@ -65,3 +65,40 @@ def test_bernoulli_stays_exact_at_extreme_logits():
 
     assert Bernoulli().log_prob(logits, target).tolist() == [-1e4, -1e4]
     assert Bernoulli().log_prob(logits, 1 - target).tolist() == [0, 0]
+
+
+def vectors():
+    return torch.randn(6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+def test_vector_normal_is_that_of_torch_distributions():
+    expected = distributions.Normal(vectors(), 0.3).log_prob(vectors().flip(0)).sum(-1)
+
+    torch.testing.assert_close(VectorNormal(0.3).log_prob(vectors(), vectors().flip(0)), expected)
+
+
+def test_one_hot_is_the_categorical_of_torch_distributions():
+    symbol = torch.arange(6) % 5
+    target = torch.nn.functional.one_hot(symbol, 5)
+
+    expected = distributions.Categorical(logits=vectors()).log_prob(symbol)
+
+    torch.testing.assert_close(OneHot().log_prob(vectors(), target), expected)
+    torch.testing.assert_close(OneHot().mean(vectors()), distributions.Categorical(logits=vectors()).probs)
+
+
+@pytest.mark.parametrize(
+    "likelihood", [Bernoulli(), Normal(0.5), VectorNormal(0.5), OneHot()], ids=lambda density: density.name
+)
+def test_samples_have_the_mean_and_the_density_of_the_likelihood(likelihood):
+    """The expectation of p(x) / p'(x) over samples of p' is one, for another density p of the same family."""
+    output, number = vectors()[0].view(1, 1, 5), 40_000
+    torch.manual_seed(0)
+
+    sample = likelihood.sample(output.expand(number, 1, 1, 5))  # (N, C, H, W), or (N, 1, 1, O)
+
+    log_ratio = likelihood.log_prob(output + 0.2, sample) - likelihood.log_prob(output, sample)
+    ratio = log_ratio.reshape(number, -1).sum(1).exp()
+    assert abs(ratio.mean() - 1) < 4 * ratio.std() / number**0.5
+    expected = output if isinstance(likelihood, Normal) else likelihood.mean(output)  # without the pictures' shift
+    assert ((sample.mean(0) - expected).abs() < 4 * sample.std(0) / number**0.5 + 1e-12).all()

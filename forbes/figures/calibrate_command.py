@@ -1,0 +1,86 @@
+"""`forbes calibrate`: whether a trained model's filter is the exact one of its own process."""
+
+import sys
+from collections.abc import Sequence
+from itertools import cycle
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from forbes.arguments import ArgumentParser, positive
+from forbes.errors import ForbesError
+from forbes.evaluation.calibration import coverage
+from forbes.evaluation.runs import TrainedRun, load_runs
+from forbes.evaluation.self_calibration import SelfCalibration, self_calibration
+from forbes.evaluation.uniformity import pearson
+from forbes.figures.calibration import RankedBelief, calibration
+from forbes.figures.style import BLACK, BLUE, GREEN, ORANGE, save_figure
+
+__all__ = ["main"]
+
+_DESCRIPTION = """\
+Check the calibration of trained models against themselves, without ground truth.
+
+  forbes calibrate runs/compare/forbes runs/compare/rssm -o figures
+
+States and observations are drawn from the model's own prior; the filter sees the observations, and the drawn state is
+ranked among samples of its belief. Ranks are uniform where the filter is exact. A small p-value says that it is not;
+that fewer than 90 % of the states lie in the 90 % region says that its beliefs are too narrow. A filter trained by the
+ELBO is expected to be so. Prints a table, and draws calibration.png and calibration.pdf."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the command with its arguments."""
+    args = _parser().parse_args(argv)
+    runs = load_runs(args.runs)
+    found = [_check(run, args.sequences, args.time, args.samples, args.seed) for run in runs]
+    _print(runs, found, args.samples)
+    names = [run.family for run in runs]
+    beliefs = [
+        RankedBelief(name if names.count(name) == 1 else f"{name} ({run.path})", colour, one.value, one.density)
+        for run, name, colour, one in zip(runs, names, cycle([BLUE, ORANGE, GREEN, BLACK]), found, strict=False)
+    ]
+    figure = calibration(beliefs, args.samples)
+    for suffix in (".png", ".pdf"):
+        save_figure(figure, args.output / f"calibration{suffix}")
+        print(args.output / f"calibration{suffix}")
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser("forbes calibrate", _DESCRIPTION)
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made")
+    parser.add_argument("--sequences", type=positive, default=1000, help="N, drawn from the model (default: 1000)")
+    parser.add_argument("--samples", type=positive, default=99, help="L, of each belief (default: 99)")
+    parser.add_argument("--time", type=positive, default=15, help="step whose belief is checked (default: 15)")
+    parser.add_argument("--seed", type=int, default=0, help="of all that is drawn (default: 0)")
+    parser.add_argument("-o", "--output", type=Path, default=Path("figures"), help="folder (default: figures)")
+    return parser
+
+
+def _check(run: TrainedRun, sequences: int, time: int, samples: int, seed: int) -> SelfCalibration:
+    """Check one run; actions are those of its training split, from the first sequence on."""
+    size = run.data.source.size("train")
+    if time > run.data.length:
+        raise ForbesError(f"--time {time}: the sequences of {run.path} have {run.data.length} steps. Choose fewer")
+    if sequences > size:
+        raise ForbesError(f"--sequences {sequences}: {run.path} was trained on {size} sequences. Choose fewer")
+    action = run.data.sequences("train", torch.arange(sequences), time).action
+    return self_calibration(run.model, action, samples, seed)
+
+
+def _print(runs: Sequence[TrainedRun], found: Sequence[SelfCalibration], samples: int) -> None:
+    table = Table(title=f"{len(found[0].density)} states drawn from the model, ranked among {samples} of the belief")
+    for header in ("run", "family"):
+        table.add_column(header, overflow="fold")
+    for header in ("within 90 %", "p, density", "p, TARP", "p, values (smallest of D, times D)"):
+        table.add_column(header, justify="right")
+    for run, one in zip(runs, found, strict=True):
+        within = coverage(one.density, samples, torch.tensor([0.9])).item()
+        each = pearson(one.value, samples)
+        values = min(1.0, each.min().item() * len(each))  # Bonferroni
+        p_values = (pearson(one.density, samples).item(), pearson(one.tarp, samples).item(), values)
+        table.add_row(escape(run.path), run.family, f"{within:.1%}", *(f"{p:.2g}" for p in p_values))
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
