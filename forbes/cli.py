@@ -27,7 +27,13 @@ COMMANDS = {
     "test": Command("run the test loop of a model", _TRAINED, "forbes.training.commands:test"),
     "predict": Command("run the prediction loop of a model", _TRAINED, "forbes.training.commands:predict"),
     "evaluate": Command("measure trained models and compare them", "RUN RUN", "forbes.evaluation.commands:main"),
+    "beliefs": Command("hold learned beliefs against exact ones", "RUN RUN", "forbes.evaluation.belief_command:main"),
     "theorem": Command("check Theorem 1 in closed form", "--steps 30", "forbes.evaluation.theorem_command:main"),
+    "compare": Command(
+        "train and measure configurations alike",
+        "configs/strokes/rssm.yaml configs/strokes/forbes.yaml --seeds 3",
+        "forbes.figures.compare_command:main",
+    ),
     "calibrate": Command(
         "check a filter against its own model", "RUN -o figures", "forbes.figures.calibrate_command:main"
     ),

@@ -1,6 +1,6 @@
 """`forbes evaluate`: bounds and proper scores of trained models, and the paired difference of each two."""
 
-import hashlib
+import argparse
 import shlex
 import sys
 import time
@@ -17,7 +17,7 @@ from rich.progress import Progress
 from forbes.arguments import ArgumentParser, positive
 from forbes.data import SequenceBatch, Simulated, Split
 from forbes.errors import ForbesError
-from forbes.evaluation.measured import Measured, pair
+from forbes.evaluation.measured import Measured, note, pair
 from forbes.evaluation.record import describe, read_record, write_record
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, split_batches
 from forbes.evaluation.scoring import PASSES, Parts, Pass, exact_pass, make_pass, score_split
@@ -25,7 +25,7 @@ from forbes.evaluation.tables import print_pairs, print_runs
 from forbes.training.provenance import commit
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["main"]
+__all__ = ["add_score_options", "evaluate", "main", "wanted_metrics"]
 
 _SUBSET = 1000  # sequences that particles are spent on, unless --digits says otherwise
 
@@ -62,11 +62,24 @@ class _Job(NamedTuple):
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = _parser().parse_args(argv)
-    runs = load_runs(args.runs, _device(args.device))
+    measured = evaluate(args.runs, args, shlex.join(["forbes", "evaluate", *argv]))
+    print_runs(measured)
+    if len(measured) > 1:
+        print_pairs(pair(measured))
+
+
+def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
+    """Measure runs on the same sequences and record it in their folders.
+
+    Args:
+        paths: run folders.
+        args: with the options of `add_score_options`.
+        command: for the record.
+    """
+    runs = load_runs(paths, _device(args.device))
     jobs = _jobs(args, runs)
     for run in runs:
         read_record(run.path)  # a broken one is said before minutes are spent
-    origin = {"command": shlex.join(["forbes", "evaluate", *argv]), "commit": commit(), "seed": args.seed}
     finished: list[Parts] = []
     measured = []
     for number, run in enumerate(runs):
@@ -74,21 +87,33 @@ def main(argv: Sequence[str]) -> None:
         for job in jobs:
             finished.append(_measure(one, job, job.sha256[number], args))
         for entry in one.entries.values():
-            entry.update(origin, date=datetime.now(UTC).isoformat(timespec="seconds"))
+            date = datetime.now(UTC).isoformat(timespec="seconds")
+            entry.update(command=command, commit=commit(), seed=args.seed, date=date, parameters=run.parameters)
         measured.append(one)
-    pairs = pair(measured)
+    for first, second, differences in pair(measured):
+        note(first, second, differences)
     for one in measured:
         write_record(one.run.path, one.entries, one.totals)
     for parts in finished:
         parts.remove()
-    print_runs(measured)
-    if pairs:
-        print_pairs(pairs)
+    return measured
+
+
+def wanted_metrics(path: str, args: Any) -> list[str]:
+    """Name the metrics that `evaluate` gives a run."""
+    (run,) = load_runs([path])
+    return [_metric_name(run, job, metric, args.split) for job in _jobs(args, [run]) for metric in job.score.metrics]
 
 
 def _parser() -> ArgumentParser:
     parser = ArgumentParser("forbes evaluate", _DESCRIPTION)
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made")
+    add_score_options(parser)
+    return parser
+
+
+def add_score_options(parser: argparse._ActionsContainer) -> None:
+    """Add what says how runs are measured."""
     parser.add_argument("--scores", nargs="+", choices=PASSES, default=PASSES, help="default: all")
     parser.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
     parser.add_argument(
@@ -101,7 +126,6 @@ def _parser() -> ArgumentParser:
     parser.add_argument("--batch-size", type=positive, default=250, help="sequences at a time (default: 250)")
     parser.add_argument("--seed", type=int, default=0, help="of the noise (default: 0)")
     parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda, cuda:1 …")
-    return parser
 
 
 def _all_or_number(text: str) -> int:
@@ -158,12 +182,18 @@ def _count(run: TrainedRun, args: Any, default: int) -> int:
     return count
 
 
+def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
+    """Name a metric in full: `test[:1000]/pll[bernoulli,K=128]`."""
+    whole = job.sequences == run.data.source.size(split)  # type: ignore[arg-type]  # argparse has checked it
+    part = "" if whole else f"[:{job.sequences}]"
+    tag = job.score.tag if job.name == "exact" else f"{run.model.likelihood.name},{job.score.tag}"
+    return f"{split}{part}/{metric}[{tag}]"
+
+
 def _measure(one: Measured, job: _Job, sha256: str, args: Any) -> Parts:
     """Make a pass for a run and add what it finds; give the parts it has left, to be removed in the end."""
     run, score = one.run, job.score
-    whole = job.sequences == run.data.source.size(args.split)
-    split = args.split if whole else f"{args.split}[:{job.sequences}]"
-    checkpoint = hashlib.sha256(RunFolder(run.path).checkpoint.read_bytes()).hexdigest()
+    checkpoint = RunFolder(run.path).checkpoint_sha256()
     parts = Parts(
         Path(run.path) / "evaluation-parts", checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed
     )
@@ -172,11 +202,11 @@ def _measure(one: Measured, job: _Job, sha256: str, args: Any) -> Parts:
     batches = _progress(batches, f"{run.path} {job.name}", job.sequences)
     scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts)
     for metric in score.metrics:
-        tag = score.tag if job.name == "exact" else f"{run.model.likelihood.name},{score.tag}"
-        name = f"{split}/{metric}[{tag}]"
+        name = _metric_name(run, job, metric, args.split)
         one.totals[name] = scores.values[metric].sum(1)  # (N,)
         one.entries[name] = describe(scores, metric) | {
             "data": {"name": data_name(run.data), "sha256": sha256},
+            "checkpoint": checkpoint,
             "device": str(next(run.model.parameters()).device),
             "seconds": round(time.monotonic() - began, 1),
         }

@@ -9,10 +9,10 @@ from torch import Tensor
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import TrainedRun
 
-__all__ = ["Measured", "Pair", "pair"]
+__all__ = ["SCORES", "Measured", "Pair", "note", "pair", "score_of"]
 
 _ALL_PAIRS = 4  # runs up to which every two are compared; of more, each with the first
-_SCORES = ("elbo", "iwae", "pll", "fivo", "open_loop")
+SCORES = ("elbo", "iwae", "pll", "fivo", "open_loop")
 """Of these more is better; the others are parts or diagnostics."""
 
 
@@ -34,21 +34,33 @@ class Pair(NamedTuple):
     differences: dict[str, Estimate]
 
 
+def score_of(metric: str) -> str:
+    """Give the score of a full name: `test[:1000]/pll[bernoulli,K=128]` to `pll`."""
+    return metric.partition("/")[2].partition("[")[0]
+
+
 def pair(measured: Sequence[Measured]) -> list[Pair]:
-    """Compare every two runs, or where there are many each with the first, and note it in the entries of both."""
-    pairs = []
-    for first, second in itertools.combinations(measured, 2):
-        if len(measured) > _ALL_PAIRS and first is not measured[0]:
-            break
-        differences = {}
-        for name in first.totals:
-            if name.partition("/")[2].partition("[")[0] not in _SCORES:
-                continue
-            difference = Estimate.of(first.totals[name] - second.totals[name])
-            differences[name] = difference
-            for one, other, sign in [(first, second, 1), (second, first, -1)]:
-                noted = {"minus": other.run.path, "mean": sign * difference.mean}
-                paired = one.entries[name].setdefault("paired", [])
-                paired.append(noted | {"standard_error": difference.standard_error})
-        pairs.append(Pair(first, second, differences))
-    return pairs
+    """Compare every two runs, or where there are many each with the first."""
+    pairs = list(itertools.combinations(measured, 2))
+    if len(measured) > _ALL_PAIRS:
+        pairs = pairs[: len(measured) - 1]  # those with the first come first
+    return [
+        Pair(
+            first,
+            second,
+            {
+                name: Estimate.of(total - second.totals[name])
+                for name, total in first.totals.items()
+                if score_of(name) in SCORES
+            },
+        )
+        for first, second in pairs
+    ]
+
+
+def note(first: Measured, second: Measured, differences: dict[str, Estimate]) -> None:
+    """Note the differences of a pair in the entries of both."""
+    for name, difference in differences.items():
+        for one, other, sign in [(first, second, 1), (second, first, -1)]:
+            mine = {"minus": other.run.path, "mean": sign * difference.mean}
+            one.entries[name].setdefault("paired", []).append(mine | {"standard_error": difference.standard_error})

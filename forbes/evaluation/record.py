@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from forbes.errors import ForbesError
@@ -18,7 +19,7 @@ from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.scoring import Scores
 from forbes.files import replace_file
 
-__all__ = ["describe", "read_record", "write_record"]
+__all__ = ["describe", "read_arrays", "read_record", "write_record"]
 
 
 def describe(scores: Scores, metric: str) -> dict[str, Any]:
@@ -50,14 +51,20 @@ def read_record(run: str) -> dict[str, Any]:
     return record
 
 
+def read_arrays(run: str) -> dict[str, NDArray[np.float64]]:
+    """Read `evaluation.npz`, the scores of each sequence by metric; none before the first evaluation."""
+    path = Path(run) / "evaluation.npz"
+    if not path.exists():
+        return {}
+    with np.load(path, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
 def write_record(run: str, entries: dict[str, dict[str, Any]], totals: dict[str, Tensor]) -> None:
     """Replace entries of `evaluation.json`, and the scores of each sequence, `(N,)`, in `evaluation.npz`."""
-    path, record = Path(run) / "evaluation.npz", read_record(run) | entries
-    arrays = {name: values.numpy() for name, values in totals.items()}
-    if path.exists():
-        with np.load(path, allow_pickle=False) as old:
-            arrays = dict(old) | arrays
+    record = read_record(run) | entries
+    arrays = read_arrays(run) | {name: values.numpy() for name, values in totals.items()}
     content = io.BytesIO()
-    np.savez(content, **arrays)  # type: ignore[arg-type]  # numpy's stub takes the names for options
-    replace_file(path, content.getvalue())
+    np.savez(content, **arrays)
+    replace_file(Path(run) / "evaluation.npz", content.getvalue())
     replace_file(Path(run) / "evaluation.json", (json.dumps(record, indent=2) + "\n").encode())

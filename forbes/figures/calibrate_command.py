@@ -17,7 +17,7 @@ from forbes.evaluation.runs import TrainedRun, load_runs
 from forbes.evaluation.self_calibration import SelfCalibration, self_calibration
 from forbes.evaluation.uniformity import pearson
 from forbes.figures.calibration import RankedBelief, calibration
-from forbes.figures.style import BLACK, BLUE, GREEN, ORANGE, save_figure
+from forbes.figures.style import PALETTE, save_figure
 
 __all__ = ["main"]
 
@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> None:
     names = [run.family for run in runs]
     beliefs = [
         RankedBelief(name if names.count(name) == 1 else f"{name} ({run.path})", colour, one.value, one.density)
-        for run, name, colour, one in zip(runs, names, cycle([BLUE, ORANGE, GREEN, BLACK]), found, strict=False)
+        for run, name, colour, one in zip(runs, names, cycle(PALETTE), found, strict=False)
     ]
     figure = calibration(beliefs, args.samples)
     for suffix in (".png", ".pdf"):

@@ -15,7 +15,7 @@ from forbes.evaluation.predictions import whole_sequences
 from forbes.evaluation.record import read_record
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable
 from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
-from forbes.figures.style import BLACK, BLUE, GREEN, ORANGE, save_figure
+from forbes.figures.style import PALETTE, save_figure
 from forbes.training.run_folder import read_metrics
 
 __all__ = ["main"]
@@ -79,7 +79,7 @@ def group(runs: Sequence[TrainedRun]) -> list[Family]:
             same.append(run)
     names = [runs_of_one[0].family for runs_of_one in members]
     families = []
-    for runs_of_one, name, colour in zip(members, names, cycle([BLUE, ORANGE, GREEN, BLACK]), strict=False):
+    for runs_of_one, name, colour in zip(members, names, cycle(PALETTE), strict=False):
         first = runs_of_one[0]
         title = name if names.count(name) == 1 else f"{name} ({first.path})"
         tests = [value for run in runs_of_one if (value := _test_elbo(run)) is not None]

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from forbes.files import replace_file
 
-__all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "density_map", "paper_style"]
+__all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "density_map", "paper_style"]
 __all__ += ["save_figure", "show_settled"]
 
 COLUMN, PAGE = 3.3, 6.9
@@ -23,6 +23,8 @@ COLUMN, PAGE = 3.3, 6.9
 BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#007a5a"
 """They differ in hue and in brightness, for the colour-blind and for print (after Okabe and Ito)."""
 BLACK, GREY = "#1a1a1a", "#808080"
+PALETTE = (BLUE, ORANGE, GREEN, BLACK, "#cc79a7", "#56b4e9", "#e69f00", GREY)
+"""For models side by side, in their order."""
 
 _STYLE: dict[Any, Any] = {
     "axes.grid": True,

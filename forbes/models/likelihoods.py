@@ -30,7 +30,7 @@ class Likelihood(ABC):
 
     @abstractmethod
     def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
-        """Give log p(target | output) in nats of whole observations: images `(*, C, H, W)` or vectors `(*, O)`, to `(*)`."""
+        """Give log p(target | output) in nats: whole images `(*, C, H, W)`, or vectors `(*, O)`, to `(*)`."""
 
 
 class Bernoulli(Likelihood):

@@ -1,0 +1,118 @@
+"""`forbes compare`: train several configurations under several seeds, measure them alike, and put them side by side."""
+
+import json
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markdown import Markdown
+
+from forbes.arguments import ArgumentParser, positive
+from forbes.errors import ForbesError
+from forbes.evaluation.commands import add_score_options, evaluate, wanted_metrics
+from forbes.evaluation.comparison import Comparison, Family, compare, markdown
+from forbes.evaluation.record import read_record
+from forbes.figures.comparison import differences, per_step, scores
+from forbes.figures.style import save_figure
+from forbes.files import replace_file
+from forbes.training.provenance import commit
+from forbes.training.run_folder import RunFolder
+
+__all__ = ["main"]
+
+_DESCRIPTION = """\
+Train configurations under several seeds, measure all of them on the same sequences, and compare.
+
+  forbes compare configs/strokes/rssm.yaml configs/strokes/forbes.yaml --seeds 3
+  forbes compare configs/strokes/rssm.yaml configs/strokes/forbes.yaml -o runs/dejong -- --data.source.origin dejong
+
+Each run is a folder DIR/NAME-SEED; what follows -- is given to each `forbes fit`. Then `forbes evaluate` measures what
+has not been measured yet. Writes comparison.csv, .json and .md, and pictures: scores, per-step, differences (to the
+first configuration). Interrupted, the same command goes on where it stopped."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the command with its arguments."""
+    cut = argv.index("--") if "--" in argv else len(argv)
+    args, flags = _parser().parse_args(argv[:cut]), list(argv[cut + 1 :])
+    command = shlex.join(["forbes", "compare", *argv])
+    families = _families(args.configs, args.seeds, args.output)
+    for config, family in zip(args.configs, families, strict=True):
+        for seed, run in family.runs.items():
+            _fit(config, seed, run, flags)
+    metrics = wanted_metrics(families[0].runs[0], args)
+    runs = [run for family in families for run in family.runs.values()]
+    missing = [run for run in runs if not _is_measured(run, metrics)]
+    if missing:
+        evaluate(missing, args, command)
+    comparison = compare(families, metrics)
+    _write(comparison, families, args.output, command)
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser("forbes compare", _DESCRIPTION)
+    parser.add_argument("configs", nargs="+", metavar="CONFIG", help="configurations; the others are held to the first")
+    parser.add_argument("--seeds", type=positive, default=1, help="runs of each, seeds 0, 1, … (default: 1)")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("runs/compare"), metavar="DIR", help="default: runs/compare"
+    )
+    measures = parser.add_argument_group("how they are measured, as for forbes evaluate")
+    add_score_options(measures)
+    return parser
+
+
+def _families(configs: Sequence[str], seeds: int, folder: Path) -> list[Family]:
+    """Name each configuration after its file, with its runs."""
+    names = [Path(config).stem for config in configs]
+    for config, name in zip(configs, names, strict=True):
+        if not Path(config).is_file():
+            raise ForbesError(f"{config}: no such configuration. Name a YAML file, e.g. configs/strokes/forbes.yaml")
+        if names.count(name) > 1:
+            raise ForbesError(f"{config}: another configuration is called {name} too. Give the files different names")
+    return [Family(name, {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)}) for name in names]
+
+
+def _fit(config: str, seed: int, run: str, flags: Sequence[str]) -> None:
+    """Train a run to its end; one that has been trained is left at once by `forbes fit --resume`."""
+    print(f"training {run}", flush=True)
+    if RunFolder(run).checkpoint.exists():
+        arguments = ["--resume", run]
+    else:
+        arguments = ["--config", config, *flags, "--seed_everything", str(seed), "--run_dir", run]
+    status = _forbes_fit(arguments)
+    if status != 0:
+        raise ForbesError(
+            f"{run}: its training ended with status {status}. Mend that, then give the same command again"
+        )
+
+
+def _forbes_fit(arguments: Sequence[str]) -> int:
+    """Run `forbes fit` in a process of its own: trainings leave nothing behind in one another."""
+    return subprocess.run([sys.executable, "-m", "forbes", "fit", *arguments], check=False).returncode
+
+
+def _is_measured(run: str, metrics: Sequence[str]) -> bool:
+    """Tell whether every metric is recorded of the run's present checkpoint."""
+    record, checkpoint = read_record(run), RunFolder(run).checkpoint_sha256()
+    return all(metric in record and record[metric]["checkpoint"] == checkpoint for metric in metrics)
+
+
+def _write(comparison: Comparison, families: Sequence[Family], folder: Path, command: str) -> None:
+    """Write tables and pictures, and print the table."""
+    text = markdown(comparison, families)
+    tables = {name: getattr(comparison, name).to_dict("records") for name in ("scores", "differences")}
+    record = {"command": command, "commit": commit(), **tables, "curves": comparison.curves}
+    replace_file(folder / "comparison.csv", comparison.scores.to_csv(index=False).encode())
+    replace_file(folder / "comparison.json", (json.dumps(record, indent=2) + "\n").encode())
+    replace_file(folder / "comparison.md", text.encode())
+    figures = {"scores": scores(comparison), "per-step": per_step(comparison)}
+    if len(families) > 1:
+        figures["differences"] = differences(comparison, families[0].name)
+    for name, figure in figures.items():
+        for suffix in (".png", ".pdf"):
+            save_figure(figure, folder / f"{name}{suffix}")
+    Console(width=None if sys.stdout.isatty() else 200).print(Markdown(text))
+    print(f"comparison.csv, .json, .md and {', '.join(figures)} are in {folder}")

@@ -1,0 +1,91 @@
+"""Families side by side in three pictures: their scores, their scores at each step, and who wins by which score."""
+
+import math
+from itertools import cycle
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from forbes.evaluation.comparison import Comparison
+from forbes.evaluation.measured import SCORES, score_of
+from forbes.figures.style import PAGE, PALETTE, paper_style
+
+__all__ = ["differences", "per_step", "scores"]
+
+_PER_STEP = ("elbo", "pll", "open_loop_marginal")
+"""Scores whose value at a step means something by itself."""
+
+
+def scores(comparison: Comparison) -> Figure:
+    """Draw each score in a panel: a dot for each seed with its standard error, a bar at the mean over seeds."""
+    table = comparison.scores
+    metrics = [metric for metric in table["metric"].unique() if score_of(metric) in SCORES]
+    families = list(table["family"].unique())
+    columns = min(3, len(metrics))
+    rows = math.ceil(len(metrics) / columns)
+    with paper_style():
+        figure = Figure((PAGE, rows * (1.1 + 0.22 * len(families))), layout="constrained")
+        panels = figure.subplots(rows, columns, sharey=True, squeeze=False).flat
+        for axes, metric in zip(panels, metrics, strict=False):
+            of_metric = table[table["metric"] == metric]
+            for place, (name, colour) in enumerate(zip(families, cycle(PALETTE), strict=False)):
+                own = of_metric[of_metric["family"] == name]
+                heights = place + 0.3 * (np.arange(1, len(own) + 1) / (len(own) + 1) - 0.5)
+                axes.errorbar(own["mean"], heights, xerr=own["standard_error"], fmt=".", color=colour, elinewidth=0.8)
+                axes.plot([own["mean"].mean()] * 2, [place - 0.35, place + 0.35], color=colour)
+            axes.set_title(_in_lines(metric))
+            axes.margins(x=0.15)
+        for axes in panels[len(metrics) :]:
+            axes.remove()
+        panels[0].set_yticks(range(len(families)), families)
+        panels[0].set_ylim(len(families) - 0.5, -0.5)
+        figure.supxlabel("nats per sequence; more is better", fontsize=8)
+    return figure
+
+
+def per_step(comparison: Comparison) -> Figure:
+    """Draw the mean of each step over sequences and seeds, a panel for each score that has one."""
+    metrics = [metric for metric in comparison.curves if score_of(metric) in _PER_STEP]
+    with paper_style():
+        figure = Figure((PAGE, 2.6), layout="constrained")
+        panels = figure.subplots(1, len(metrics), squeeze=False)[0]
+        for axes, metric in zip(panels, metrics, strict=True):
+            _draw_steps(axes, comparison.curves[metric], metric)
+        panels[0].set_ylabel("nats per step")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return figure
+
+
+def _draw_steps(axes: Axes, curves: dict[str, list[float]], metric: str) -> None:
+    for (name, curve), colour in zip(curves.items(), cycle(PALETTE), strict=False):
+        steps = np.arange(1, len(curve) + 1)
+        shown = np.cumsum(np.abs(curve)) > 0  # the open-loop score begins after its context
+        axes.plot(steps[shown], np.asarray(curve)[shown], color=colour, label=name)
+    axes.set_title(_in_lines(metric))
+    axes.set_xlabel("step")
+
+
+def differences(comparison: Comparison, first: str) -> Figure:
+    """Draw the mean difference to the first family, families × scores; colours compare within a column."""
+    table = comparison.differences.groupby(["family", "metric"], sort=False)["mean"].mean().unstack(sort=False)
+    values = table.to_numpy()  # (families, scores)
+    with paper_style():
+        figure = Figure((PAGE, 0.9 + 0.3 * len(table)), layout="constrained")
+        axes = figure.subplots()
+        largest = np.abs(values).max(0)
+        axes.imshow(values / np.where(largest > 0, largest, 1), cmap="PuOr", vmin=-3, vmax=3, aspect="auto")
+        for (row, column), value in np.ndenumerate(values):
+            axes.text(column, row, f"{value:+.2f}", ha="center", va="center")
+        axes.set_xticks(range(len(table.columns)), [_in_lines(metric) for metric in table.columns])
+        axes.set_yticks(range(len(table)), table.index)
+        axes.set_title(f"nats per sequence more than {first}, paired, mean over seeds")
+        axes.grid(visible=False)
+    return figure
+
+
+def _in_lines(metric: str) -> str:
+    """Break `test[:1000]/pll[bernoulli,K=128]` into the score, the split and the numbers."""
+    split, _, rest = metric.partition("/")
+    score, _, tag = rest.partition("[")
+    return f"{score}\n{split}\n[{tag}"

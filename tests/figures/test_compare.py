@@ -1,0 +1,116 @@
+"""`forbes compare`: trains, measures and puts side by side; interrupted, it goes on."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from forbes.cli import main
+from forbes.evaluation.comparison import Family, compare
+from forbes.evaluation.record import read_arrays
+from forbes.figures import compare_command
+from forbes.figures.comparison import differences, per_step, scores
+
+ELBO = "test/elbo[bernoulli,S=2]"
+MEASURES = ["--samples", "2", "--particles", "2", "--futures", "2", "--context", "2"]
+
+
+def in_this_process(arguments):
+    """A process of its own would spend most of the test on its imports."""
+    return main(["fit", *arguments])
+
+
+@pytest.fixture(scope="module")
+def configs(tiny_config, tmp_path_factory):
+    """The tiny configuration, and one of an RSSM beside it."""
+    rssm = tmp_path_factory.mktemp("configs") / "rssm.yaml"
+    text = tiny_config.read_text().replace(
+        "{class_path: FlowBelief, init_args: {layers: 2, width: 4}}", "GaussianBelief"
+    )
+    rssm.write_text(text)
+    return [str(rssm), str(tiny_config)]
+
+
+@pytest.fixture(scope="module")
+def compared(configs, tmp_path_factory):
+    """The folder of a comparison of two families with two seeds each."""
+    folder = tmp_path_factory.mktemp("compared")
+    arguments = ["compare", *configs, "--seeds", "2", "-o", str(folder), *MEASURES]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compare_command, "_forbes_fit", in_this_process)
+        assert main([*arguments, "--", "--trainer.max_epochs", "1"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def families(compared):
+    return [Family(name, {seed: str(compared / f"{name}-{seed}") for seed in range(2)}) for name in ("rssm", "forbes")]
+
+
+def test_every_configuration_is_trained_under_every_seed_with_the_flags(compared):
+    for name in ("rssm", "forbes"):
+        for seed in range(2):
+            provenance = json.loads((compared / f"{name}-{seed}" / "provenance.json").read_text())
+            assert str(seed) in json.dumps(provenance)
+            metrics = (compared / f"{name}-{seed}" / "metrics.jsonl").read_text().splitlines()
+            assert json.loads(metrics[-1])["update"] == 5  # one epoch instead of two
+
+
+def test_the_tables_hold_every_score_and_the_paired_differences_of_equal_seeds(compared):
+    table = pd.read_csv(compared / "comparison.csv")
+    assert set(table["family"]) == {"rssm", "forbes"}
+    assert {"elbo", "iwae", "pll", "fivo", "open_loop"} <= {name[5:].split("[")[0] for name in table["metric"]}
+
+    record = json.loads((compared / "comparison.json").read_text())
+    elbo = {row["seed"]: row for row in record["differences"] if row["metric"] == ELBO}
+    for seed in range(2):
+        forbes, rssm = (read_arrays(str(compared / f"{name}-{seed}"))[ELBO] for name in ("forbes", "rssm"))
+        assert elbo[seed]["mean"] == pytest.approx((forbes - rssm).mean())
+        assert elbo[seed]["standard_error"] == pytest.approx((forbes - rssm).std(ddof=1) / np.sqrt(len(rssm)))
+        assert f"{(forbes - rssm).mean():.2f} ±" in (compared / "comparison.md").read_text()
+
+
+def test_the_pictures_are_there_and_show_the_values(compared, families):
+    assert {path.name for path in compared.glob("*.png")} == {"scores.png", "per-step.png", "differences.png"}
+    comparison = compare(families, [ELBO])
+
+    (panel,) = scores(comparison).axes
+    own = comparison.scores.groupby("family", sort=False)["mean"]
+    bars = [line.get_xdata()[0] for line in panel.lines if len(line.get_xdata()) == 2 and line.get_marker() == "None"]
+    assert bars == pytest.approx(own.mean().tolist())
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["rssm", "forbes"]
+
+    (panel,) = per_step(comparison).axes
+    assert panel.lines[1].get_ydata() == pytest.approx(comparison.curves[ELBO]["forbes"])
+
+    (panel,) = differences(comparison, "rssm").axes
+    assert panel.texts[0].get_text() == f"{comparison.differences['mean'].mean():+.2f}"
+
+
+def test_given_again_it_trains_and_measures_nothing(configs, compared, monkeypatch, capfd):
+    measured = []
+    monkeypatch.setattr(compare_command, "_forbes_fit", in_this_process)
+    monkeypatch.setattr(compare_command, "evaluate", lambda *arguments: measured.append(arguments))
+    before = {path: path.read_bytes() for path in compared.rglob("evaluation.json")}
+
+    assert main(["compare", *configs, "--seeds", "2", "-o", str(compared), *MEASURES]) == 0
+
+    assert measured == []
+    assert {path: path.read_bytes() for path in compared.rglob("evaluation.json")} == before
+
+
+def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_path, capsys):
+    def error_of(*arguments):
+        capsys.readouterr()
+        assert main(["compare", *arguments, "-o", str(tmp_path)]) == 2
+        return capsys.readouterr().err.splitlines()[-1]
+
+    assert "absent.yaml: no such configuration" in error_of("absent.yaml")
+    twin = tmp_path / "rssm.yaml"
+    twin.write_text(Path(configs[0]).read_text())
+    assert "another configuration is called rssm" in error_of(configs[0], str(twin))
+    assert "its training ended with status 2" in error_of(configs[0], "--", "--model.no_such_key", "1")
+    with pytest.raises(Exception, match=r"rssm-0: evaluation.json has no test/bleu"):
+        compare(families, ["test/bleu"])
