@@ -1,6 +1,6 @@
 # Everything works on a machine that has only Python >= 3.11, git and make: the first target called makes .venv.
 #   make fit [CONFIG=configs/strokes/forbes.yaml]   train, and draw the pictures
-#   make compare                                    FORBES against RSSM: two trainings, their table, the paper's figures
+#   make compare                                    FORBES against RSSM: two trainings, their scores, the paper's figures
 #   make test | lint | bench
 PYTHON ?= python3
 CONFIG ?= configs/strokes/forbes.yaml
@@ -12,16 +12,10 @@ BIN := .venv/bin
 fit: .venv/installed
 	$(BIN)/forbes fit --config $(CONFIG)
 
-compare: runs/compare/forbes/fitted runs/compare/rssm/fitted
-	$(BIN)/forbes evaluate runs/compare/forbes runs/compare/rssm
-	$(BIN)/forbes figures strokes --runs runs/compare/forbes runs/compare/rssm -o runs/compare/figures
-
-# An interrupted training goes on where its last checkpoint was written.
-runs/compare/%/fitted: .venv/installed
-	if [ -e runs/compare/$*/checkpoints/last.ckpt ]; \
-	then $(BIN)/forbes fit --resume runs/compare/$*; \
-	else $(BIN)/forbes fit --config configs/strokes/$*.yaml --run_dir runs/compare/$*; fi
-	touch $@
+# Interrupted, it goes on where it stopped.
+compare: .venv/installed
+	$(BIN)/forbes compare configs/strokes/rssm.yaml configs/strokes/forbes.yaml -o runs/compare
+	$(BIN)/forbes figures strokes --runs runs/compare/forbes-0 runs/compare/rssm-0 -o runs/compare/figures
 
 test: .venv/installed-dev
 	$(BIN)/pytest -q

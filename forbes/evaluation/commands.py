@@ -32,8 +32,8 @@ _SUBSET = 1000  # sequences that particles are spent on, unless --digits says ot
 _DESCRIPTION = f"""\
 Measure trained models by bounds and proper scores, and compare them on the same sequences.
 
-  forbes evaluate runs/compare/forbes runs/compare/rssm
-  forbes evaluate runs/compare/forbes --scores elbo pll --digits 200
+  forbes evaluate runs/compare/forbes-0 runs/compare/rssm-0
+  forbes evaluate runs/compare/forbes-0 --scores elbo pll --digits 200
 
 Nats per sequence of observations, fully normalised, without free nats; the KL is the Monte-Carlo estimate for every
 family; mean and standard error over sequences. An ELBO alone does not tell a good belief: it prefers one that is too

@@ -24,7 +24,7 @@ __all__ = ["main"]
 _DESCRIPTION = """\
 Check the calibration of trained models against themselves, without ground truth.
 
-  forbes calibrate runs/compare/forbes runs/compare/rssm -o figures
+  forbes calibrate runs/compare/forbes-0 runs/compare/rssm-0 -o figures
 
 States and observations are drawn from the model's own prior; the filter sees the observations, and the drawn state is
 ranked among samples of its belief. Ranks are uniform where the filter is exact. A small p-value says that it is not;

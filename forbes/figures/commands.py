@@ -23,7 +23,7 @@ __all__ = ["main"]
 _DESCRIPTION = """\
 Draw the paper's figures from run folders, each as PNG and PDF.
 
-  forbes figures strokes --runs runs/compare/forbes runs/compare/rssm -o figures
+  forbes figures strokes --runs runs/compare/forbes-0 runs/compare/rssm-0 -o figures
 
 strokes: predictions-t30 (Figure 4), the same rolled on to the end of the longest digit, and elbo (Figure 5). Runs that
 differ in their seed only are one family: Figure 4 shows the first of them, Figure 5 their mean and range.

@@ -214,7 +214,7 @@ def test_its_help_shows_an_example(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["evaluate", "--help"])
     assert stop.value.code == 0
-    assert "forbes evaluate runs/compare/forbes runs/compare/rssm" in capsys.readouterr().out
+    assert "forbes evaluate runs/compare/forbes-0 runs/compare/rssm-0" in capsys.readouterr().out
 
 
 def test_runs_of_different_data_are_not_compared(runs, tiny_config, tmp_path, capsys):
