@@ -80,6 +80,8 @@ def error_of(capsys, *arguments):
         (["--model.kl", "exact"], "model.kl: is exact, expected one of ['analytic', 'monte_carlo']"),
         (["--trainer.max_epochs", "many"], "trainer.max_epochs: is many, expected int or null"),
         (["--data.length", "0"], "length is 0, expected at least 1"),
+        (["--model.learning_rate", "null"], "learning_rate is None, expected a number above 0"),
+        (["--model.state_dim", "0"], "state_dim is 0, expected a number above 0"),
         (["--data.batch_size", "-1"], "batch_size is -1, expected at least 1"),
         (["--data.batch_size", "21"], "batch_size is 21, but the training split has 20 sequences"),
         (["--trainer.devices", "0"], "devices"),

@@ -11,6 +11,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from forbes.beliefs import BeliefFamily, FlowBelief
 from forbes.data import SequenceBatch
+from forbes.errors import ForbesError
 from forbes.models.elbo import ElboTerms, FreeNats, elbo_loss
 from forbes.models.likelihoods import Likelihood, Normal
 from forbes.models.networks import ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily
@@ -43,6 +44,9 @@ class WorldModel(LightningModule):
         warmup: updates over which the learning rate rises from 0; a high rate needs it.
         clip_norm: gradients are scaled down to this norm.
         seed: of the noise of training and validation.
+
+    Raises:
+        ForbesError: when a size, the learning rate or `clip_norm` is not above 0.
     """
 
     def __init__(
@@ -68,6 +72,10 @@ class WorldModel(LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        _require_positive(
+            state_dim=state_dim, hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers,
+            learning_rate=learning_rate, clip_norm=clip_norm,
+        )  # fmt: skip
         self.model = StateSpaceModel(
             belief,
             encoder(observation_shape),
@@ -146,3 +154,9 @@ class WorldModel(LightningModule):
             f"{split}/kl": (terms.kl * terms.mask).sum(1).mean(),
         }
         self.log_dict({name: value.detach() for name, value in values.items()}, batch_size=count)
+
+
+def _require_positive(**numbers: Any) -> None:
+    for name, number in numbers.items():
+        if number is None or not number > 0:  # a configuration can say null
+            raise ForbesError(f"WorldModel: {name} is {number}, expected a number above 0")
