@@ -1,11 +1,15 @@
 """The flow belief of FORBES (Chen et al., 2022, arXiv 2205.11051, equations of §3.1)."""
 
+from functools import partial
+from typing import Literal
+
 import torch
 from torch import Tensor
 
 from forbes.beliefs.base import BeliefHead, Sampler
-from forbes.beliefs.flows import ConditionalFlow
+from forbes.beliefs.flows import AffineCoupling, ConditionalFlow
 from forbes.beliefs.gaussian import GaussianBelief
+from forbes.beliefs.splines import SplineCoupling
 from forbes.deferred import Loop
 
 __all__ = ["FlowBelief"]
@@ -20,20 +24,30 @@ class FlowBelief(BeliefHead):
     At initialisation f is the identity: the belief is exactly `GaussianBelief`.
 
     Args:
-        state_dim: D, at least 2.
+        state_dim: D, at least 2 with affine couplings.
         context_dim: C.
         layers: K coupling layers; 5 for DeepMind Control, 3 for digit strokes (paper, appendix).
         width: width of each coupling network; the paper does not give it.
         min_std: smallest standard deviation of the base, the same as the Gaussian belief's.
+        coupling: "affine" is the paper's; "spline" also splits a one-dimensional state (Durkan et al., 2019).
+        bins: of each spline; 8 as in Durkan et al.
     """
 
     def __init__(
-        self, state_dim: int, context_dim: int, layers: int = 5, width: int = 64, min_std: float = 0.1
+        self,
+        state_dim: int,
+        context_dim: int,
+        layers: int = 5,
+        width: int = 64,
+        min_std: float = 0.1,
+        coupling: Literal["affine", "spline"] = "affine",
+        bins: int = 8,
     ) -> None:
         super().__init__(state_dim, context_dim)
         self.base = GaussianBelief(state_dim, context_dim, min_std)
         with torch.random.fork_rng(devices=[]):  # the same seed gives a Gaussian belief the same other weights
-            self.flow = ConditionalFlow(state_dim, context_dim, layers, width)
+            family = AffineCoupling if coupling == "affine" else partial(SplineCoupling, bins=bins)
+            self.flow = ConditionalFlow(state_dim, context_dim, layers, width, family)
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """See `BeliefHead.rsample`."""

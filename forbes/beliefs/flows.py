@@ -1,9 +1,11 @@
-"""Conditional normalizing flows: affine coupling layers with LU-linear layers between them (paper §2.2 and appendix).
+"""Conditional normalizing flows: coupling layers with LU-linear layers between them (paper §2.2 and appendix).
 
-One direction generates (base noise to state), the other evaluates (`inverse`); both cost the same.
+The affine coupling here is the paper's; `splines.py` has another. One direction generates (base noise to state), the
+other evaluates (`inverse`); both cost the same.
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -14,13 +16,15 @@ from torch.nn.functional import linear, pad, softplus
 from forbes.deferred import Affine, Bind
 from forbes.errors import ForbesError
 
-__all__ = ["AffineCoupling", "ConditionalFlow", "FlowMap", "LULinear"]
+__all__ = ["AffineCoupling", "ConditionalFlow", "Coupling", "CouplingFamily", "FlowMap", "LULinear", "bind_now"]
 
 LOG_SCALE_BOUND = 2.0
 """|ℓ| stays below this in each layer: a plain exp explodes (nflows issue 49), a sigmoid could only contract."""
 
 FlowMap: TypeAlias = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """(x, context) to (y, log|det|)."""
+CouplingFamily: TypeAlias = Callable[[int, int, bool], "Coupling"]
+"""Builds a coupling layer from (dim, width, swap): a class with its other arguments bound."""
 
 
 class LULinear(nn.Module):
@@ -60,50 +64,99 @@ class LULinear(nn.Module):
         return inverse
 
 
-class AffineCoupling(nn.Module):
-    r"""Affine coupling: :math:`y_a = x_a` and :math:`y_b = x_b \odot e^{\ell} + t`, :math:`(\ell, t) = NN(x_a, c)`.
+class Coupling(nn.Module, ABC):
+    r"""One part of x moves, elementwise and increasing, as the rest says: :math:`y_a = x_a,\ y_b = g(x_b; NN(x_a, c))`.
 
-    The network is the paper's: a linear layer, one residual block of two linear layers, a linear layer. The context's
-    share of the first layer arrives ready made (`ConditionalFlow` computes it for all layers in one matmul).
-    :math:`\ell = 2 \tanh(u/2)` is bounded. The last layer starts at zero, so the flow starts as the identity.
-
-    To have nothing to cut and join, the first layer reads all of x with zero weights for x_b, and the last one writes
-    all of :math:`(\ell, t)` with zeros for x_a.
+    The network is the paper's: a linear layer, one residual block of two linear layers, and a last linear layer, which
+    each kind of coupling has for itself. The context's share of the first layer arrives ready made (`ConditionalFlow`
+    computes it for all layers in one matmul). To have nothing to cut, the first layer reads all of x with zero weights
+    for x_b.
 
     Args:
-        dim: D, at least 2.
+        dim: D; if it is 1, all of x moves and the network reads the context only.
         width: W of the network.
         swap: False transforms the second part given the first, True the first given the second.
     """
 
     def __init__(self, dim: int, width: int, swap: bool) -> None:
         super().__init__()
-        given = dim // 2 if not swap else dim - dim // 2
-        # Zeros to the left and to the right of what reads x_a, and of what writes (ℓ, t) of x_b.
-        self.around_given = (dim - given, 0) if swap else (0, dim - given)
-        self.around_other = (0, given) if swap else (given, 0)
-        self.first = nn.Linear(given, width, bias=False)
+        self.given = dim // 2 if not swap else dim - dim // 2
+        self.other, self.swap = dim - self.given, swap
+        self.first = nn.Linear(self.given, width, bias=False) if self.given else None
         self.inner, self.outer = nn.Linear(width, width), nn.Linear(width, width)
-        self.log_scale, self.shift = nn.Linear(width, dim - given), nn.Linear(width, dim - given)
+
+    @abstractmethod
+    def generator(self, bind: Bind) -> FlowMap:
+        """Prepare (x, share) -> (y, log-slopes): `(*, D)` and `(*, W)` to `(*, D)` and what sums to log|det ∂y/∂x|."""
+
+    @abstractmethod
+    def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+        """Give x, `(*, D)`, and the forward log-slopes at it."""
+
+    def hidden(self, bind: Bind) -> Callable[[Tensor, Tensor], Tensor]:
+        """Prepare the network but for its last layer: (x, share) to `(*, W)`."""
+        inner, outer = bind(self.inner.weight, self.inner.bias), bind(self.outer.weight, self.outer.bias)
+
+        def block(hidden: Tensor) -> Tensor:
+            return hidden + outer(inner(hidden.relu()).relu())
+
+        if self.first is None:
+            return lambda x, share: block(share)
+        weight = pad(self.first.weight, (self.other, 0) if self.swap else (0, self.other))  # (W, D)
+        first = bind(weight, weight.new_zeros(len(weight)))
+        return lambda x, share: block(first(x) + share)
+
+
+class AffineCoupling(Coupling):
+    r"""Affine coupling: :math:`y_a = x_a` and :math:`y_b = x_b \odot e^{\ell} + t`, :math:`(\ell, t) = NN(x_a, c)`.
+
+    :math:`\ell = 2 \tanh(u/2)` is bounded. The last layer starts at zero, so the flow starts as the identity. To have
+    nothing to join, it writes all of :math:`(\ell, t)` with zeros for x_a.
+
+    Args:
+        dim: D, at least 2.
+        width: as of any `Coupling`.
+        swap: likewise.
+
+    Raises:
+        ForbesError: when `dim` is below 2.
+    """
+
+    def __init__(self, dim: int, width: int, swap: bool) -> None:
+        if dim < 2:
+            raise ForbesError(f"AffineCoupling: state_dim is {dim}, expected at least 2 to split. Use coupling: spline")
+        super().__init__(dim, width, swap)
+        self.log_scale, self.shift = nn.Linear(width, self.other), nn.Linear(width, self.other)
         for layer in (self.log_scale, self.shift):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
-    def network(self, bind: Bind) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Prepare (x, share) -> (tanh(u/2), t): shapes `(*, D)` and `(*, W)` to twice `(*, D)`, zeros for x_a."""
-        weight = self.first.weight
-        first = bind(pad(weight, self.around_given), weight.new_zeros(len(weight)))
-        inner, outer = bind(self.inner.weight, self.inner.bias), bind(self.outer.weight, self.outer.bias)
-        rows, columns = (0, 0, *self.around_other), self.around_other
+    def generator(self, bind: Bind) -> FlowMap:
+        """See `Coupling.generator`; the log-slopes are `(*, D)`."""
+        network = self._network(bind)
+
+        def generate(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+            log_scale, shift = network(x, share)
+            return torch.addcmul(shift, x, log_scale.exp()), log_scale
+
+        return generate
+
+    def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+        """See `Coupling.inverse`."""
+        log_scale, shift = self._network(bind_now)(y, share)
+        return (y - shift) * (-log_scale).exp(), log_scale
+
+    def _network(self, bind: Bind) -> FlowMap:
+        """Prepare (x, share) -> (ℓ, t): shapes `(*, D)` and `(*, W)` to twice `(*, D)`, zeros for x_a."""
+        hidden, around = self.hidden(bind), (0, self.given) if self.swap else (self.given, 0)
+        rows = (0, 0, *around)
         weight = torch.cat((pad(self.log_scale.weight / LOG_SCALE_BOUND, rows), pad(self.shift.weight, rows)))
-        bias = torch.cat((pad(self.log_scale.bias / LOG_SCALE_BOUND, columns), pad(self.shift.bias, columns)))
+        bias = torch.cat((pad(self.log_scale.bias / LOG_SCALE_BOUND, around), pad(self.shift.bias, around)))
         last = bind(weight, bias)  # (2 D, W), (2 D,)
 
         def network(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-            hidden = first(x) + share
-            hidden = hidden + outer(inner(hidden.relu()).relu())
-            raw, shift = last(hidden).chunk(2, -1)  # 2 x (*, D)
-            return raw.tanh(), shift
+            raw, shift = last(hidden(x, share)).chunk(2, -1)  # 2 x (*, D)
+            return LOG_SCALE_BOUND * raw.tanh(), shift
 
         return network
 
@@ -112,23 +165,25 @@ class ConditionalFlow(nn.Module):
     r"""K coupling layers, an LU-linear layer between neighbours: :math:`f = f_K \circ \dots \circ f_1` given c.
 
     Args:
-        dim: D, at least 2 (a coupling layer must split it).
+        dim: D.
         context_dim: C.
         layers: K coupling layers; alternate parts are transformed.
         width: W of each coupling network.
+        coupling: builds a layer from (dim, width, swap).
 
     Raises:
-        ForbesError: when `dim` is below 2 or `layers` below 1.
+        ForbesError: when `layers` is below 1.
     """
 
-    def __init__(self, dim: int, context_dim: int, layers: int, width: int) -> None:
+    def __init__(
+        self, dim: int, context_dim: int, layers: int, width: int, coupling: CouplingFamily = AffineCoupling
+    ) -> None:
         super().__init__()
-        if dim < 2:
-            raise ForbesError(f"ConditionalFlow: state_dim is {dim}, a coupling layer needs at least 2 to split")
         if layers < 1:
             raise ForbesError(f"ConditionalFlow: layers is {layers}, expected at least 1; use GaussianBelief for none")
         self.context = nn.Linear(context_dim, layers * width)
-        self.couplings = nn.ModuleList(AffineCoupling(dim, width, swap=bool(k % 2)) for k in range(layers))
+        swaps = [dim > 1 and bool(k % 2) for k in range(layers)]  # one dimension has nothing to take turns with
+        self.couplings = nn.ModuleList(coupling(dim, width, swap) for swap in swaps)
         self.mixings = nn.ModuleList(LULinear(dim) for _ in range(layers - 1))
 
     def generator(self, bind: Bind) -> FlowMap:
@@ -138,41 +193,38 @@ class ConditionalFlow(nn.Module):
         """
         of_context = bind(self.context.weight, self.context.bias)
         couplings, lu_layers = self._layers()
-        networks = [coupling.network(bind) for coupling in couplings]
+        steps = [coupling.generator(bind) for coupling in couplings]
         mixings = [bind(layer.matrix(), layer.bias) for layer in lu_layers]
         constant = self._constant_log_det()
 
         def generate(x: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
-            log_scales = []
-            for k, share in enumerate(of_context(context).chunk(len(networks), -1)):  # K x (*, W)
-                x = mixings[k - 1](x) if k > 0 else x
-                half, shift = networks[k](x, share)
-                log_scales.append(LOG_SCALE_BOUND * half)
-                x = torch.addcmul(shift, x, log_scales[-1].exp())
-            return x, torch.cat(log_scales, -1).sum(-1) + constant
+            log_slopes = []
+            for k, share in enumerate(of_context(context).chunk(len(steps), -1)):  # K x (*, W)
+                x, log_slope = steps[k](mixings[k - 1](x) if k > 0 else x, share)
+                log_slopes.append(log_slope)
+            return x, torch.cat(log_slopes, -1).sum(-1) + constant
 
         return generate
 
     def forward(self, x: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
         """Generate: y = f(x; c), shape `(*, D)`, and log|det ∂y/∂x| in nats, shape `(*)`."""
-        return self.generator(_bind_now)(x, context)
+        return self.generator(bind_now)(x, context)
 
     def inverse(self, y: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
         """Evaluate: x = f⁻¹(y; c), shape `(*, D)`, and the forward log|det ∂y/∂x| at it in nats, shape `(*)`."""
         couplings, lu_layers = self._layers()
         shares = self.context(context).chunk(len(couplings), -1)  # K x (*, W)
-        log_scales = []
+        log_slopes = []
         for k in reversed(range(len(couplings))):
-            half, shift = couplings[k].network(_bind_now)(y, shares[k])
-            log_scales.append(LOG_SCALE_BOUND * half)
-            y = (y - shift) * (-log_scales[-1]).exp()
+            y, log_slope = couplings[k].inverse(y, shares[k])
+            log_slopes.append(log_slope)
             if k > 0:
                 y = linear(y - lu_layers[k - 1].bias, lu_layers[k - 1].inverse_matrix())
-        return y, torch.cat(log_scales, -1).sum(-1) + self._constant_log_det()
+        return y, torch.cat(log_slopes, -1).sum(-1) + self._constant_log_det()
 
-    def _layers(self) -> tuple[list[AffineCoupling], list[LULinear]]:
+    def _layers(self) -> tuple[list[Coupling], list[LULinear]]:
         return (
-            [layer for layer in self.couplings if isinstance(layer, AffineCoupling)],
+            [layer for layer in self.couplings if isinstance(layer, Coupling)],
             [layer for layer in self.mixings if isinstance(layer, LULinear)],
         )
 
@@ -181,6 +233,6 @@ class ConditionalFlow(nn.Module):
         return sum((layer.log_det() for layer in self._layers()[1]), start=self.context.bias.new_zeros(()))
 
 
-def _bind_now(weight: Tensor, bias: Tensor) -> Affine:
+def bind_now(weight: Tensor, bias: Tensor) -> Affine:
     """Bind outside a time loop."""
     return lambda x: linear(x, weight, bias)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 import yaml
 
-from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
+from forbes.beliefs import BeliefHead, CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
 from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
 from forbes.models import StateSpaceModel
@@ -19,7 +19,12 @@ from forbes.training.run_folder import RunFolder
 
 __all__ = ["TrainedRun", "data_name", "data_sha256", "load_runs", "require_comparable", "split_batches"]
 
-_FAMILIES: dict[type[BeliefHead], str] = {GaussianBelief: "RSSM", FlowBelief: "FORBES"}
+_FAMILIES: dict[type[BeliefHead], str] = {
+    GaussianBelief: "RSSM",
+    FlowBelief: "FORBES",
+    MixtureBelief: "Mixture",
+    CategoricalBelief: "Categorical",
+}
 
 
 class TrainedRun(NamedTuple):
@@ -34,7 +39,7 @@ class TrainedRun(NamedTuple):
 
     @property
     def family(self) -> str:
-        """The model's name: RSSM or FORBES, with what its experiment's name adds, e.g. RSSM wide for `rssm_wide`."""
+        """The model's name, e.g. FORBES, with what its experiment's name adds, e.g. RSSM wide for `rssm_wide`."""
         name = _FAMILIES.get(type(self.model.prior), type(self.model.prior).__name__)
         for part in reversed(Path(self.path).resolve().parts):
             if match := re.fullmatch(f"{name}((?:_[a-z]+)+)", part, re.IGNORECASE):

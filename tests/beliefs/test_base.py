@@ -1,4 +1,8 @@
-"""What every belief family promises: its samples have the density it gives. A new family is one line in FAMILIES."""
+"""What every belief family promises: its samples have the density it gives. A new family is one line in FAMILIES.
+
+The tests that need a plane to integrate over are for CONTINUOUS families; each has its counterpart for DISCRETE ones,
+whose support can be listed.
+"""
 
 import math
 from functools import partial
@@ -6,18 +10,41 @@ from functools import partial
 import pytest
 import torch
 
-from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
+from forbes.beliefs import BeliefHead, CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
+from forbes.deferred import Loop
 
 CONTEXT = 3
-FAMILIES = {
+CLASSES = 3
+
+
+def one_hots(number, context_dim) -> BeliefHead:
+    """As many variables as the others have dimensions."""
+    return CategoricalBelief(CLASSES * number, context_dim, classes=CLASSES)
+
+
+CONTINUOUS = {
     "gaussian": GaussianBelief,
     "flow": partial(FlowBelief, layers=4, width=8),
+    "spline": partial(FlowBelief, layers=2, width=8, coupling="spline", bins=5),
+    "mixture": partial(MixtureBelief, components=3),
 }
+DISCRETE = {"categorical": one_hots}
+FAMILIES = CONTINUOUS | DISCRETE
 
 
 @pytest.fixture(params=FAMILIES, name="family")
 def family_fixture(request):
     return FAMILIES[request.param]
+
+
+@pytest.fixture(params=CONTINUOUS, name="continuous")
+def continuous_fixture(request):
+    return CONTINUOUS[request.param]
+
+
+@pytest.fixture(params=DISCRETE, name="discrete")
+def discrete_fixture(request):
+    return DISCRETE[request.param]
 
 
 def random_head(family, dim=2, seed=0) -> BeliefHead:
@@ -43,9 +70,15 @@ def probability_on_grid(head, context, half_width=20.0, cells=500):
     return edges[1:], (density * side**2).view(cells, cells)
 
 
+def support(head):
+    """Every state that a discrete head can give, (P, D): each variable takes each of its classes."""
+    one_hot, number = torch.eye(CLASSES, dtype=torch.float64), head.state_dim // CLASSES
+    return one_hot[torch.cartesian_prod(*[torch.arange(CLASSES)] * number)].flatten(1)
+
+
 @pytest.mark.parametrize("seed", range(2))
-def test_density_integrates_to_one(family, seed):
-    head = random_head(family, seed=seed)
+def test_density_integrates_to_one(continuous, seed):
+    head = random_head(continuous, seed=seed)
 
     _, probability = probability_on_grid(head, contexts(1, seed)[0])
 
@@ -54,8 +87,17 @@ def test_density_integrates_to_one(family, seed):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_samples_follow_the_density(family, seed):
-    head, context, number = random_head(family, seed=seed), contexts(1, seed)[0], 20_000
+def test_probabilities_sum_to_one(discrete, seed):
+    head = random_head(discrete, seed=seed)
+
+    probability = head.log_prob(support(head), contexts(1, seed)[0]).exp()
+
+    torch.testing.assert_close(probability.sum(), torch.ones_like(probability[0]))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_samples_follow_the_density(continuous, seed):
+    head, context, number = random_head(continuous, seed=seed), contexts(1, seed)[0], 20_000
 
     edges, probability = probability_on_grid(head, context)
     samples = head.rsample(context, (number,))[0].detach()  # (number, 2)
@@ -72,25 +114,50 @@ def test_samples_follow_the_density(family, seed):
     assert abs(observed - probability[: row + 1, : column + 1].sum()) < 4 * math.sqrt(0.25 / number)
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_samples_follow_the_probabilities(discrete, seed):
+    head, context, number = random_head(discrete, seed=seed), contexts(1, seed)[0], 20_000
+    states = support(head)
+
+    samples = head.rsample(context, (number,))[0].detach()  # (number, D)
+    hits = (samples[:, None] - states).abs().amax(-1) < 1e-12  # (number, P); straight-through adds p - p
+
+    assert (hits.sum(1) == 1).all()
+    # Hoeffding: one share of the P is further off than sqrt(log(2 P / a) / 2 n) with probability at most a = 1e-4.
+    limit = math.sqrt(math.log(2 * len(states) / 1e-4) / (2 * number))
+    assert (hits.double().mean(0) - head.log_prob(states, context).exp()).abs().max() < limit
+
+
 def test_log_prob_of_a_sample_is_what_rsample_gave(family):
     head, context = random_head(family, dim=5), contexts(7)
 
     state, log_prob = head.rsample(context, (11,))
 
-    assert state.shape == (11, 7, 5)
+    assert state.shape == (11, 7, head.state_dim)
     assert log_prob.shape == (11, 7)
     torch.testing.assert_close(head.log_prob(state, context), log_prob)
 
 
-def test_samples_are_reparameterised(family):
+def test_samples_are_reparameterised(continuous):
     """d/dc E[s] by the gradient of samples equals the difference of means with common noise."""
-    head, context = random_head(family), contexts(1)[0].requires_grad_()
+    head, context = random_head(continuous), contexts(1)[0].requires_grad_()
 
     def mean(at):
         torch.manual_seed(0)
         return head.rsample(at, (100,))[0].sum(-1).mean()
 
     assert torch.autograd.gradcheck(mean, context)
+
+
+def test_gradients_of_samples_are_those_of_their_mean(discrete):
+    """A straight-through sample carries d/dc E[s] itself, and so does whatever is linear in each variable."""
+    head, context = random_head(discrete), contexts(1)[0].requires_grad_()
+    states, weight = support(head), torch.arange(head.state_dim, dtype=torch.float64)
+
+    sample = (head.rsample(context, (10,))[0] @ weight).mean()
+    mean = head.log_prob(states, context).exp() @ states @ weight
+
+    torch.testing.assert_close(torch.autograd.grad(sample, context), torch.autograd.grad(mean, context))
 
 
 def test_gradients_reach_every_parameter_from_samples_and_from_densities(family):
@@ -120,4 +187,34 @@ def test_stays_finite_far_from_the_data(family):
 
     assert state.isfinite().all()
     assert log_prob.isfinite().all()
-    assert head.log_prob(1e3 * torch.ones(5, 4), context).isfinite().all()
+    assert head.log_prob(1e3 * torch.ones(5, head.state_dim), context).isfinite().all()
+
+
+def test_in_a_time_loop_the_draws_and_their_gradients_are_the_same(family):
+    head, context = random_head(family, dim=4), contexts(3 * 5).view(3, 5, CONTEXT)
+    results = []
+
+    for sample in (head.rsample, head.sampler(Loop(steps=3, batch=5))):
+        torch.manual_seed(0)
+        states, log_probs = zip(*(sample(step) for step in context), strict=True)
+        loss = torch.stack(states).square().sum() + torch.stack(log_probs).sum()
+        results.append((loss, *torch.autograd.grad(loss, list(head.parameters()))))
+
+    torch.testing.assert_close(results[0], results[1])
+
+
+def test_a_time_loop_compiles_to_one_graph(family):
+    head, context = random_head(family).float(), contexts(2 * 3).view(2, 3, CONTEXT).float()
+
+    def loss():
+        sample = head.sampler(Loop(steps=2, batch=3))
+        states, log_probs = zip(*(sample(step) for step in context), strict=True)
+        return (torch.stack(log_probs) - head.log_prob(torch.stack(states) + 1, context)).square().sum()
+
+    torch.compiler.reset()
+    results = []
+    for form in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
+        torch.manual_seed(0)
+        results.append(torch.autograd.grad(form(), list(head.parameters())))
+
+    torch.testing.assert_close(results[0], results[1])

@@ -1,5 +1,6 @@
 """The flow belief against the Gaussian it starts as, and what it can do that a Gaussian cannot."""
 
+import pytest
 import torch
 
 from forbes.beliefs import FlowBelief, GaussianBelief
@@ -7,9 +8,10 @@ from forbes.beliefs import FlowBelief, GaussianBelief
 CONTEXT = 6
 
 
-def test_starts_as_the_gaussian_belief():
+@pytest.mark.parametrize("coupling", ["affine", "spline"])
+def test_starts_as_the_gaussian_belief(coupling):
     torch.manual_seed(0)
-    flow, gaussian = FlowBelief(30, CONTEXT), GaussianBelief(30, CONTEXT)
+    flow, gaussian = FlowBelief(30, CONTEXT, coupling=coupling), GaussianBelief(30, CONTEXT)
     flow.base.load_state_dict(gaussian.state_dict())
     context = torch.randn(7, CONTEXT)
 

@@ -1,0 +1,76 @@
+"""The categorical belief of DreamerV2 (Hafner et al., 2021, arXiv 2010.02193)."""
+
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from forbes.beliefs.base import BeliefHead, Sampler
+from forbes.deferred import Loop
+from forbes.errors import ForbesError
+
+__all__ = ["CategoricalBelief"]
+
+
+class CategoricalBelief(BeliefHead):
+    r"""G independent one-hot variables of K classes each: s is their concatenation, of dimension D = G K.
+
+    .. math:: p(s \mid c) = \prod_{g=1}^G \prod_{k=1}^K \pi_{gk}(c)^{s_{gk}}, \qquad \pi_g = \mathrm{softmax}(\cdot)
+
+    A probability, not a density. Gradients are straight-through, :math:`\partial s := \partial \pi` (DreamerV2,
+    algorithm 1): exact for the mean of what is linear in each variable, as log p is, and biased elsewhere.
+
+    Args:
+        state_dim: D, a multiple of `classes`; DreamerV2 has 1024.
+        context_dim: C.
+        classes: K; 32 as in DreamerV2.
+
+    Raises:
+        ForbesError: when `state_dim` is no multiple of `classes`.
+    """
+
+    def __init__(self, state_dim: int, context_dim: int, classes: int = 32) -> None:
+        super().__init__(state_dim, context_dim)
+        if state_dim % classes:
+            raise ForbesError(f"CategoricalBelief: state_dim is {state_dim}, expected a multiple of classes, {classes}")
+        self.classes = classes
+        self.logits_of = nn.Linear(context_dim, state_dim)
+
+    def log_probabilities(self, context: Tensor) -> Tensor:
+        """Give log π, `(*, G, K)`."""
+        return self._log_probabilities(self.logits_of(context))
+
+    def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+        """See `BeliefHead.rsample`; the gradient is straight-through."""
+        return _draw(self.log_probabilities(context), sample_shape)
+
+    def sampler(self, loop: Loop) -> Sampler:
+        """See `BeliefHead.sampler`."""
+        logits_of = loop.affine(self.logits_of.weight, self.logits_of.bias)
+        return lambda context: _draw(self._log_probabilities(logits_of(context)))
+
+    def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
+        """See `BeliefHead.log_prob`; of one-hot states."""
+        return (state * self.log_probabilities(context).flatten(-2)).sum(-1)
+
+    def kl(self, context: Tensor, prior: BeliefHead, prior_context: Tensor) -> Tensor | None:
+        r"""See `BeliefHead.kl`; the closed form exists between two of the same classes.
+
+        .. math:: \sum_{g,k} \pi_{gk} (\log \pi_{gk} - \log \pi^{prior}_{gk})
+        """
+        if not isinstance(prior, CategoricalBelief) or prior.classes != self.classes:
+            return None
+        ours, theirs = self.log_probabilities(context), prior.log_probabilities(prior_context)  # 2 x (*, G, K)
+        return (ours.exp() * (ours - theirs)).sum((-2, -1))
+
+    def _log_probabilities(self, logits: Tensor) -> Tensor:
+        variables: Tensor = logits.unflatten(-1, (-1, self.classes))  # (*, G, K)
+        return variables.log_softmax(-1)
+
+
+def _draw(log_probability: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+    # The largest of log π - log E, E exponential, is at k with probability π_k: no call that waits for the device.
+    shape = (*sample_shape, *log_probability.shape)  # (*sample_shape, *, G, K)
+    race = log_probability.new_empty(shape).exponential_().log()
+    drawn = one_hot((log_probability.detach() - race).argmax(-1), log_probability.shape[-1])  # (*, G, K)
+    probability = log_probability.exp()
+    state = (drawn + (probability - probability.detach())).flatten(-2)  # (*, D)
+    return state, (state * log_probability.flatten(-2)).sum(-1)

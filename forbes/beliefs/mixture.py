@@ -1,0 +1,151 @@
+"""The Gaussian mixture belief (Tschiatschek et al., 2018, arXiv 1805.09281)."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from forbes.beliefs.base import BeliefHead, Sampler
+from forbes.deferred import Loop
+
+__all__ = ["Mixture", "MixtureBelief"]
+
+
+class Mixture(NamedTuple):
+    """M diagonal Gaussians."""
+
+    log_weight: Tensor
+    """log w, normalised, `(*, M)`."""
+    mean: Tensor
+    """μ, `(*, M, D)`."""
+    std: Tensor
+    """σ, `(*, M, D)`."""
+
+    def log_prob(self, state: Tensor) -> Tensor:
+        """Give log p(s) in nats: shape `(*, D)` to `(*)`."""
+        log_density = _standard_log_density((state.unsqueeze(-2) - self.mean) / self.std) - self.std.log()  # (*, M, D)
+        return (self.log_weight + log_density.sum(-1)).logsumexp(-1)
+
+
+class MixtureBelief(BeliefHead):
+    r"""Mixture of diagonal Gaussians, all of its parameters functions of the context.
+
+    .. math:: p(s \mid c) = \sum_{m=1}^M w_m(c) \prod_d N(s_d; \mu_{md}(c), \sigma_{md}(c)^2), \quad
+              w = \mathrm{softmax}(\cdot), \ \sigma = \mathrm{softplus}(\cdot) + \sigma_{min}
+
+    A draw maps D normal numbers :math:`z_d`, one dimension after the other, through the quantile functions of
+
+    .. math:: F_d(s_d \mid s_{<d}) = \sum_m r_{md}\, \Phi\!\left(\frac{s_d - \mu_{md}}{\sigma_{md}}\right) = \Phi(z_d),
+              \qquad r_{md} \propto w_m \prod_{j<d} N(s_j; \mu_{mj}, \sigma_{mj}^2)
+
+    found by bisection. Gradients are those of that map, by implicit differentiation (Figurnov et al., 2018, arXiv
+    1805.08498): :math:`\partial s / \partial\theta = -(\partial F / \partial s)^{-1}\, \partial F / \partial\theta` is
+    the exact pathwise gradient, unbiased for weights, means and standard deviations alike. Where modes lie far apart,
+    the weights' share of it comes from the few draws between them, each divided by the small density there.
+
+    Bisection makes this the dearest family in a time loop, since its operations are many and grow with D: on digit
+    strokes (D = 8, one thread) an update has seven times those of the affine flow and takes 1.7 times as long.
+
+    Args:
+        state_dim: D.
+        context_dim: C.
+        components: M.
+        min_std: smallest standard deviation, the same as the Gaussian belief's.
+    """
+
+    def __init__(self, state_dim: int, context_dim: int, components: int = 5, min_std: float = 0.1) -> None:
+        super().__init__(state_dim, context_dim)
+        self.components, self.min_std = components, min_std
+        self.parameters_of = nn.Linear(context_dim, components * (1 + 2 * state_dim))
+
+    def mixture(self, context: Tensor) -> Mixture:
+        """Give the mixture of a context."""
+        return self._mixture(self.parameters_of(context))
+
+    def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+        """See `BeliefHead.rsample`."""
+        return _draw(self.mixture(context), sample_shape)
+
+    def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
+        """See `BeliefHead.log_prob`."""
+        return self.mixture(context).log_prob(state)
+
+    def sampler(self, loop: Loop) -> Sampler:
+        """See `BeliefHead.sampler`."""
+        parameters_of = loop.affine(self.parameters_of.weight, self.parameters_of.bias)
+        return lambda context: _draw(self._mixture(parameters_of(context)))
+
+    def _mixture(self, parameters: Tensor) -> Mixture:
+        size = self.components * self.state_dim
+        logits, mean, raw_std = parameters.split((self.components, size, size), -1)
+        shape = (self.components, self.state_dim)
+        std = softplus(raw_std.unflatten(-1, shape)) + self.min_std  # (*, M, D)
+        return Mixture(logits.log_softmax(-1), mean.unflatten(-1, shape), std)  # (*, M), (*, M, D), (*, M, D)
+
+
+def _standard_log_density(noise: Tensor) -> Tensor:
+    """Give log N(ε; 0, 1) of each number."""
+    return -0.5 * (noise.square() + math.log(2 * math.pi))
+
+
+def _draw(mixture: Mixture, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+    mean = mixture.mean
+    shape = (*sample_shape, *mean.shape[:-2], mean.shape[-1])
+    noise = torch.randn(shape, dtype=mean.dtype, device=mean.device)  # (*sample_shape, *, D)
+    with torch.no_grad():
+        state = _quantiles(mixture, noise)
+    state = _reparameterised(mixture, state, noise)
+    return state, mixture.log_prob(state)
+
+
+def _quantiles(mixture: Mixture, noise: Tensor) -> Tensor:
+    r"""Solve :math:`F_d(s_d \mid s_{<d}) = \Phi(z_d)` for all d in turn: shape `(*, D)` to `(*, D)`.
+
+    Bisection between the smallest and the largest of the components' own quantiles :math:`\mu_m + \sigma_m z`, as many
+    times as a number has bits. It compares the smaller of the two tails, so both keep their relative precision:
+    :math:`\sum_m r_m\, \mathrm{erfc}(\pm t_m / \sqrt2)` against :math:`\mathrm{erfc}(|z| / \sqrt2)`.
+    """
+    log_weight, states = mixture.log_weight, []
+    halvings = round(-math.log2(torch.finfo(noise.dtype).eps))
+    for z, mean, std in zip(noise.unbind(-1), mixture.mean.unbind(-1), mixture.std.unbind(-1), strict=True):
+        own = mean + std * z.unsqueeze(-1)  # (*, M)
+        low, high = own.amin(-1), own.amax(-1)  # (*), (*)
+        side = torch.ones_like(z).copysign(z)  # of the smaller tail, (*)
+        scale = side.unsqueeze(-1) / (std * math.sqrt(2))  # (*, M)
+        offset, weight = -mean * scale, log_weight.softmax(-1)  # (*, M), (*, M)
+        target, step = torch.erfc(z.abs() / math.sqrt(2)), side * (high - low) / 4  # (*), (*)
+        state = (low + high) / 2
+        for _ in range(halvings):
+            tail = (weight * torch.erfc(torch.addcmul(offset, scale, state.unsqueeze(-1)))).sum(-1)  # (*)
+            state, step = torch.addcmul(state, step, (tail - target).sign()), step / 2
+        states.append(state)
+        log_weight = log_weight + _standard_log_density((state.unsqueeze(-1) - mean) / std) - std.log()  # (*, M)
+    return torch.stack(states, -1)  # (*, D)
+
+
+def _reparameterised(mixture: Mixture, state: Tensor, noise: Tensor) -> Tensor:
+    r"""Give the same numbers with the gradient :math:`-J^{-1}\, \partial F / \partial\theta`, J lower triangular.
+
+    .. math:: J_{dj} = \frac{\partial F_d}{\partial s_j} = -\sum_m r_{md} (\Phi_{md} - F_d) \frac{s_j - \mu_{mj}}
+              {\sigma_{mj}^2} \ (j < d), \qquad J_{dd} = p(s_d \mid s_{<d})
+    """
+    noise_of = (state.unsqueeze(-2) - mixture.mean) / mixture.std  # (*, M, D)
+    log_density = _standard_log_density(noise_of) - mixture.std.log()  # (*, M, D)
+    log_weight = mixture.log_weight.expand(log_density.shape[:-1]).unsqueeze(-1)  # (*, M, 1)
+    share = torch.cat((log_weight, log_density[..., :-1]), -1).cumsum(-1).softmax(-2)  # (*, M, D)
+    side = torch.ones_like(noise).copysign(noise).unsqueeze(-2)  # (*, 1, D)
+    # The smaller tail again, as a function that rises: Φ where z < 0, else Φ - 1.
+    tails = -0.5 * side * torch.erfc(side * noise_of / math.sqrt(2))  # (*, M, D)
+    tail = (share * tails).sum(-2)  # (*, D)
+    with torch.no_grad():
+        density = (share * log_density.exp()).sum(-2)  # (*, D)
+        # Where rounding of F hides where in a gap between modes the draw lies, its gradient is bounded.
+        density = density.clamp(min=torch.finfo(density.dtype).eps)
+        below = (share * (tails - tail.unsqueeze(-2))).mT @ (-noise_of / mixture.std)  # (*, D, D)
+        jacobian = below.tril(-1) + density.diag_embed()  # (*, D, D)
+    change: Tensor = torch.linalg.solve_triangular(
+        jacobian, (tail - tail.detach()).unsqueeze(-1), upper=False
+    )  # (*, D, 1)
+    return state - change.squeeze(-1)

@@ -1,0 +1,75 @@
+"""The categorical belief against torch.distributions."""
+
+import pytest
+import torch
+from torch.distributions import Independent, OneHotCategorical, kl_divergence
+
+from forbes.beliefs import CategoricalBelief, GaussianBelief
+from forbes.errors import ForbesError
+
+CONTEXT = 6
+
+
+def head(classes=4, seed=0):
+    torch.manual_seed(seed)
+    return CategoricalBelief(12, CONTEXT, classes).double()
+
+
+def contexts(*shape, seed=1):
+    return 3 * torch.randn(*shape, CONTEXT, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def oracle(belief, context):
+    return Independent(OneHotCategorical(logits=belief.logits_of(context).unflatten(-1, (-1, belief.classes))), 1)
+
+
+def test_probability_is_that_of_torch_distributions():
+    belief, context = head(), contexts(5)
+    state = oracle(belief, context).sample((8,))  # (8, 5, 3, 4)
+
+    expected = oracle(belief, context).log_prob(state)
+
+    torch.testing.assert_close(belief.log_prob(state.flatten(-2), context), expected)
+
+
+def test_each_variable_takes_one_class():
+    state, _ = head().rsample(contexts(5), (100,))
+
+    variables = state.detach().unflatten(-1, (3, 4))
+    torch.testing.assert_close(variables.sort(-1).values, torch.eye(4)[3].double().expand_as(variables))
+
+
+def test_closed_form_kl_is_that_of_torch_distributions():
+    posterior, prior = head(seed=0), head(seed=1)
+    context, prior_context = contexts(5, 3, seed=1), contexts(5, 3, seed=2)
+
+    kl = posterior.kl(context, prior, prior_context)
+
+    torch.testing.assert_close(kl, kl_divergence(oracle(posterior, context), oracle(prior, prior_context)))
+
+
+def test_monte_carlo_kl_has_the_mean_gradient_of_the_closed_form():
+    """log q - log p is linear in each variable, so straight-through is exact but for the score, whose mean is zero."""
+    posterior, prior, number = head(seed=0), head(seed=1), 20_000
+    at = contexts(seed=1).requires_grad_()
+    repeated = at.detach().expand(number, -1).clone().requires_grad_()
+
+    expected = torch.autograd.grad(posterior.kl(at, prior, at), at)[0]
+    torch.manual_seed(0)
+    state, log_prob = posterior.rsample(repeated)
+    estimate = log_prob - prior.log_prob(state, repeated)
+    gradients = torch.autograd.grad(estimate.sum(), repeated)[0]  # (number, C)
+
+    assert ((gradients.mean(0) - expected).abs() < 4 * gradients.std(0) / number**0.5).all()
+
+
+def test_there_is_no_closed_form_between_other_families_or_other_classes():
+    context = contexts(2)
+
+    assert head().kl(context, GaussianBelief(12, CONTEXT).double(), context) is None
+    assert head(classes=4).kl(context, head(classes=6), context) is None
+
+
+def test_refuses_a_state_that_is_not_made_of_whole_variables():
+    with pytest.raises(ForbesError, match="state_dim is 30, expected a multiple of classes, 32"):
+        CategoricalBelief(30, CONTEXT)

@@ -1,0 +1,183 @@
+"""The splines against zuko, beyond their box, at their extremes, and what they do to a state of one dimension."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from forbes.beliefs import FlowBelief
+from forbes.beliefs.splines import BOUND, MIN_SIZE, SplineCoupling, knot_table, spline, spline_inverse
+from forbes.errors import ForbesError
+
+CONTEXT = 3
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def random_belief(dim, layers=3, bins=6, seed=0, scale=0.3):
+    """A spline flow in float64 with no weight where it starts."""
+    torch.manual_seed(seed)
+    belief = FlowBelief(dim, CONTEXT, layers, width=8, coupling="spline", bins=bins).double()
+    with torch.no_grad():
+        for parameter in belief.parameters():
+            parameter += scale * torch.randn_like(parameter)
+    return belief
+
+
+@pytest.fixture(scope="module")
+def zuko():
+    """The oracle; importing it switches off the validation of all torch.distributions, which is put back here."""
+    import zuko
+
+    torch.distributions.Distribution.set_default_validate_args(True)
+    return zuko
+
+
+def as_zuko(transforms, table):
+    """Build zuko's spline with the same bins; its soft clips are undone first."""
+    _, _, width, height, _, next_slope = table.unbind(-2)
+
+    def unclip(value, limit):
+        return value / (1 - value.abs() / limit)
+
+    half, whole = -math.log(1e-3) / 2, -math.log(1e-3)
+    sizes = [size.log() - size.log().mean(-1, keepdim=True) for size in (width, height)]  # a softmax ignores the mean
+    slopes = unclip(next_slope[..., :-1].log(), whole)
+    return transforms.MonotonicRQSTransform(*(unclip(size, half) for size in sizes), slopes, bound=BOUND)
+
+
+@pytest.mark.parametrize("bins", [2, 3, 8])
+def test_agrees_with_zuko_given_equal_bins(zuko, bins):
+    table, x = knot_table(normal(50, 3 * bins - 1)), 3 * normal(200, 50, seed=1)
+
+    y, log_slope = spline(x, table)
+    oracle = as_zuko(zuko.transforms, table)
+    expected, expected_log_slope = oracle.call_and_ladj(x)
+
+    torch.testing.assert_close(y, expected)
+    torch.testing.assert_close(log_slope, expected_log_slope)
+    torch.testing.assert_close(spline_inverse(expected, table)[0], oracle.inv(expected))
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(dim=st.integers(1, 5), layers=st.integers(1, 4), bins=st.integers(2, 9), seed=st.integers(0, 10**6))
+def test_inverse_undoes_the_flow_and_both_give_the_log_determinant_of_the_jacobian(dim, layers, bins, seed):
+    flow = random_belief(dim, layers, bins, seed, scale=0.15).flow
+    x, context = 2 * normal(dim, seed=seed), normal(CONTEXT, seed=1)
+
+    y, log_det = flow(x, context)
+    back, log_det_at_y = flow.inverse(y, context)
+    jacobian = torch.autograd.functional.jacobian(lambda point: flow(point, context)[0], x)
+
+    torch.testing.assert_close(back, x, rtol=1e-6, atol=1e-6)  # the condition numbers of the layers multiply
+    torch.testing.assert_close(log_det_at_y, log_det, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(log_det, torch.linalg.slogdet(jacobian).logabsdet)
+
+
+@pytest.mark.parametrize("direction", [spline, spline_inverse])
+def test_beyond_the_box_it_is_the_identity_whatever_its_knots(direction):
+    raw = (3 * normal(6, 23)).requires_grad_()
+    x = torch.tensor([-1e6, -7.0, -BOUND, BOUND, 7.0, 1e6], dtype=torch.float64, requires_grad=True)
+
+    y, log_slope = direction(x, knot_table(raw))
+    by_x, by_raw = torch.autograd.grad((y + log_slope).sum(), (x, raw))
+    beyond = [0, 1, 4, 5]  # at the edge itself the slope has two derivatives
+
+    torch.testing.assert_close(y, x)
+    torch.testing.assert_close(log_slope, torch.zeros_like(x))
+    torch.testing.assert_close(by_x[beyond], torch.ones_like(x)[beyond])
+    torch.testing.assert_close(by_raw[beyond], torch.zeros_like(raw)[beyond])
+    assert by_x.isfinite().all()
+    assert by_raw.isfinite().all()
+
+
+def test_gradients_inside_the_box_are_those_of_differences():
+    raw, x = normal(5, 11).requires_grad_(), (2 * normal(5, seed=1)).requires_grad_()
+
+    for direction in (spline, spline_inverse):
+        assert torch.autograd.gradcheck(lambda x, raw, by=direction: by(x, knot_table(raw)), (x, raw))
+
+
+def test_stays_increasing_bounded_and_invertible_in_float32_with_the_wildest_knots():
+    """Narrowest bins beside widest, steepest knots beside flattest: nothing divides by zero, no root is imaginary."""
+    table = knot_table(100 * normal(2000, 23).float())
+    x = torch.linspace(-BOUND, BOUND, 2000)
+    edges = table[:, 1].sort(-1).values[:, 3]  # where rounding decides on which side of a knot a number lies
+
+    y, log_slope = spline(x, table)
+    xs, log_slopes = zip(*(spline_inverse(points, table) for points in (x, y, edges)), strict=True)
+
+    assert (log_slope <= math.log(4 / MIN_SIZE)).all()  # s^2 max(s, d) / (s / 2)^2, s and d below 1 / MIN_SIZE
+    assert all(values.isfinite().all() for values in (log_slope, *xs, *log_slopes))
+    assert all((points.abs() <= BOUND * (1 + 1e-6)).all() for points in (y, *xs))
+    ladder, steps = spline(x[:, None].expand(-1, 50), table[:50])[0].diff(dim=0), 4 * BOUND * torch.finfo().eps
+    assert (ladder >= -steps).all(), "not increasing"
+
+
+def test_a_last_knot_that_rounding_left_below_the_edge_of_the_box_does_no_harm():
+    """The sum of 32 float32 bins is 5 to a few 1e-6; a last bin this steep magnifies that a million times."""
+    short, flat, steep = 1e-5, [-BOUND, -BOUND, 9.99, 0.01, 1.0, 1.0], [4.99, -4.99, 0.01, 9.99, 1.0, 1.0]
+    table = torch.tensor([flat, steep], dtype=torch.float64).T  # (6, 2)
+    table[1, 1] -= short
+
+    x, log_slope = spline_inverse(torch.tensor(BOUND, dtype=torch.float64), table)
+
+    torch.testing.assert_close(x.item(), BOUND)
+    assert log_slope.item() == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("dim", [1, 5])
+def test_a_float32_flow_finds_its_way_back(dim):
+    belief, context = random_belief(dim, layers=3, scale=0.1).float(), normal(1000, CONTEXT).float()
+    x = normal(1000, dim, seed=1).float()
+
+    y, log_det = belief.flow(x, context)
+    back, log_det_at_y = belief.flow.inverse(y, context)
+
+    assert (back - x).abs().max() < 1e-4
+    assert (log_det - log_det_at_y).abs().max() < 1e-3
+
+
+def test_a_density_and_a_context_broadcast_either_way():
+    for dim in (1, 3):
+        belief = random_belief(dim)
+        states, context = normal(4, 1, dim), normal(5, CONTEXT, seed=1)
+
+        together = belief.log_prob(states, context)
+
+        assert together.shape == (4, 5)
+        torch.testing.assert_close(together[2], belief.log_prob(states[2, 0], context))
+        torch.testing.assert_close(together[:, 3], belief.log_prob(states[:, 0], context[3]))
+
+
+def test_splits_a_one_dimensional_belief_into_two_narrow_modes():
+    """Fitted to N(±1, 0.1²) it comes within 0.05 nats; the Gaussian of that spread has 1.6."""
+    torch.manual_seed(0)
+    belief, context = FlowBelief(1, 1, layers=2, width=16, coupling="spline"), torch.ones(1)
+    optimizer = torch.optim.Adam(belief.parameters(), lr=1e-2)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1, 0, total_iters=400)
+    for _ in range(400):
+        sign = torch.randint(2, (256, 1)).mul(2).sub(1)
+        loss = -belief.log_prob(sign + 0.1 * torch.randn(256, 1), context).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+
+    grid = torch.linspace(-2, 2, 4001)
+    modes = torch.distributions.Normal(torch.tensor([-1.0, 1.0]), 0.1)
+    target = modes.log_prob(grid[:, None]).exp().mean(-1)  # (4001,)
+    with torch.no_grad():
+        log_ratio = target.log().clamp(min=-100) - belief.log_prob(grid[:, None], context)
+    forward_kl = (target * log_ratio).sum() * (grid[1] - grid[0])
+
+    assert forward_kl < 0.05
+
+
+def test_refuses_a_spline_of_one_bin():
+    with pytest.raises(ForbesError, match="bins is 1"):
+        SplineCoupling(4, 8, False, bins=1)
