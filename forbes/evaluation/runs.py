@@ -40,7 +40,9 @@ class TrainedRun(NamedTuple):
     @property
     def family(self) -> str:
         """The model's name, e.g. FORBES, with what its experiment's name adds, e.g. RSSM wide for `rssm_wide`."""
-        name = _FAMILIES.get(type(self.model.prior), type(self.model.prior).__name__)
+        prior, posterior = self.model.prior, self.model.posterior
+        kind = type(prior if isinstance(posterior, GaussianBelief) else posterior)  # FORBES may have a flow in one only
+        name = _FAMILIES.get(kind, kind.__name__)
         for part in reversed(Path(self.path).resolve().parts):
             if match := re.fullmatch(f"{name}((?:_[a-z]+)+)", part, re.IGNORECASE):
                 return name + match[1].replace("_", " ")

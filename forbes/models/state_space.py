@@ -84,6 +84,7 @@ class StateSpaceModel(nn.Module):
         hidden_dim: H of h.
         mlp_dim: width of every perceptron, and C of the belief's contexts.
         mlp_layers: layers of every perceptron.
+        prior: builds the prior's instead, where it is of another family.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class StateSpaceModel(nn.Module):
         hidden_dim: int,
         mlp_dim: int,
         mlp_layers: int,
+        prior: BeliefFamily | None = None,
     ) -> None:
         super().__init__()
         self.state_dim, self.hidden_dim = state_dim, hidden_dim
@@ -105,7 +107,7 @@ class StateSpaceModel(nn.Module):
         self.gru = nn.GRUCell(mlp_dim, hidden_dim)
         self.prior_context = perceptron(hidden_dim, mlp_dim, mlp_layers)
         self.posterior_context = perceptron(hidden_dim + encoder.embedding_dim, mlp_dim, mlp_layers)
-        self.prior: BeliefHead = belief(state_dim, mlp_dim)
+        self.prior: BeliefHead = (prior or belief)(state_dim, mlp_dim)
         self.posterior: BeliefHead = belief(state_dim, mlp_dim)
 
     def initial(self, batch: int) -> State:

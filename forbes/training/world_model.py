@@ -26,6 +26,7 @@ class WorldModel(LightningModule):
 
     Args:
         belief: the family of prior and posterior, a class of `forbes.beliefs` with its own arguments.
+        prior: the family of the prior, where it is another one: a flow in only one of the two.
         encoder: o_t to e_t, a class of `forbes.models.networks`.
         decoder: features to the likelihood's parameters, likewise.
         likelihood: what the decoder's output means; `Normal()` by default.
@@ -52,6 +53,7 @@ class WorldModel(LightningModule):
     def __init__(
         self,
         belief: BeliefFamily = FlowBelief,
+        prior: BeliefFamily | None = None,
         encoder: EncoderFamily = ConvEncoder,
         decoder: DecoderFamily = ConvDecoder,
         likelihood: Likelihood | None = None,
@@ -86,6 +88,7 @@ class WorldModel(LightningModule):
             hidden_dim,
             mlp_dim,
             mlp_layers,
+            prior,
         )
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.learning_rate, self.schedule, self.warmup = learning_rate, schedule, warmup

@@ -10,7 +10,13 @@ from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, State, StateSpaceMo
 
 BATCH, TIME, ACTION, STATE, HIDDEN = 5, 6, 2, 4, 7
 SHAPE = (1, 6, 6)
-FAMILIES = {"gaussian": GaussianBelief, "flow": partial(FlowBelief, layers=3, width=8)}
+FLOW = partial(FlowBelief, layers=3, width=8)
+FAMILIES = {  # of the posterior, and of the prior where it is another
+    "gaussian": (GaussianBelief, None),
+    "flow": (FLOW, None),
+    "flow in the posterior": (FLOW, GaussianBelief),
+    "flow in the prior": (GaussianBelief, FLOW),
+}
 
 
 @pytest.fixture(params=FAMILIES, name="family")
@@ -36,9 +42,10 @@ class Bernoulli64(Bernoulli):
 
 
 def make_model(family, action_dim=ACTION, width=9, seed=0):
+    belief, prior = family
     torch.manual_seed(seed)
     return StateSpaceModel(
-        family,
+        belief,
         MLPEncoder(SHAPE, width, layers=1),
         MLPDecoder(HIDDEN + STATE, SHAPE, width, layers=1),
         Bernoulli64(),
@@ -47,6 +54,7 @@ def make_model(family, action_dim=ACTION, width=9, seed=0):
         hidden_dim=HIDDEN,
         mlp_dim=width,
         mlp_layers=2,
+        prior=prior,
     ).double()
 
 
