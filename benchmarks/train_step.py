@@ -17,11 +17,13 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 import yaml
 from textbook import Textbook
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
@@ -52,7 +54,21 @@ def dmc(form: str, batch: int) -> tuple[WorldModel, SequenceBatch]:
     shape = (batch, 50)
     observation = torch.randint(256, (*shape, 3, 64, 64), dtype=torch.uint8)
     mask = torch.ones(shape, dtype=torch.bool)
-    return world, SequenceBatch(observation, torch.rand(*shape, ACTIONS), torch.zeros(shape), mask)
+    action, no_state = torch.rand(*shape, ACTIONS), torch.zeros(*shape, 0)
+    return world, SequenceBatch(observation, action, torch.zeros(shape), mask, no_state)
+
+
+class Operations(TorchDispatchMode):
+    """Counts the tensor operations that run under it, backward passes included."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.number = 0
+
+    def __torch_dispatch__(self, operation: Any, types: Any, arguments: Any = (), options: Any = None) -> Any:
+        """Count one operation and run it."""
+        self.number += 1
+        return operation(*arguments, **(options or {}))
 
 
 class Update:
@@ -78,6 +94,12 @@ class Update:
         torch.manual_seed(seed)
         with torch.no_grad():
             return self.eager_loss().item()
+
+    def operations(self) -> int:
+        """Count the tensor operations of an update: a number that no other program disturbs."""
+        with Operations() as operations:
+            self()
+        return operations.number
 
     def __call__(self) -> float:
         """Make the update and give the seconds of processor time it took."""
@@ -128,18 +150,25 @@ def say(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def measure(shape: str, options: argparse.Namespace) -> list[str]:
+def memories(options: argparse.Namespace) -> dict[tuple[str, str], float]:
+    """Measure the memory of every form; before all else, since a child's peak begins at its parent's size."""
+    result = {}
+    for shape in options.shapes:
+        for form in FORMS:
+            say(f"{shape}: memory of {form}")
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                result[shape, form] = pool.apply(memory, (shape, form, options.threads, options.dmc_batch))
+    return result
+
+
+def measure(shape: str, needed: dict[tuple[str, str], float], options: argparse.Namespace) -> list[str]:
     """Measure one shape: the rows of the table."""
-    memories = {}
-    for form in FORMS:  # first, since a child's peak begins at its parent's size
-        say(f"{shape}: memory of {form}")
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            memories[form] = pool.apply(memory, (shape, form, options.threads, options.dmc_batch))
     updates = {form: Update(shape, form, options.dmc_batch) for form in FORMS}
     ours, theirs = updates["flow"].loss_of_noise(0), updates["textbook"].loss_of_noise(0)
     assert abs(ours - theirs) <= TOLERANCE * abs(theirs), f"losses differ: {ours} and {theirs}"
     say(f"{shape}: loss {ours:.4f}, textbook {theirs:.4f}; {options.repeats} rounds")
     rows = dict.fromkeys(FORMS, "")
+    columns = {form: f"{update.operations()} | {needed[shape, form]:.0f}" for form, update in updates.items()}
     if shape in options.compile:
         updates["compiled"] = Update(shape, "flow", options.dmc_batch)
         say(f"{shape}: compiling")
@@ -148,7 +177,7 @@ def measure(shape: str, options: argparse.Namespace) -> list[str]:
     return [
         f"| {shape} | {form}{note} | {1e3 * statistics.median(seconds[form]):.0f} "
         f"| {ratio(seconds[form], seconds['gaussian']):.2f} | {ratio(seconds[form], seconds['flow']):.2f} "
-        f"| {format(memories[form], '.0f') if form in memories else ''} |"
+        f"| {columns.get(form, ' | ')} |"
         for form, note in rows.items()
     ]
 
@@ -171,11 +200,12 @@ def main() -> None:
         f"median of {options.repeats} interleaved updates, DMC with {options.dmc_batch} sequences of 50 steps, "
         f"load average {os.getloadavg()[0]:.1f}.",
         "",
-        "| shape | form | ms per update | over gaussian | over flow | MiB that updates need |",
-        "|---|---|---:|---:|---:|---:|",
+        "| shape | form | ms per update | over gaussian | over flow | operations | MiB that updates need |",
+        "|---|---|---:|---:|---:|---:|---:|",
     ]
+    needed = memories(options)
     for shape in options.shapes:
-        table += measure(shape, options)
+        table += measure(shape, needed, options)
     options.output.write_text("\n".join(table) + "\n")
     print("\n".join(table))
 

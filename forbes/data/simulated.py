@@ -21,6 +21,8 @@ class SimulatedSequences(NamedTuple):
     """o_t, float32 (B, T, O)."""
     action: Tensor
     """a_{t-1}, float32 (B, T, A)."""
+    state: Tensor
+    """s_t, float32 (B, T, D)."""
 
 
 class Simulated(SequenceSource):
@@ -73,11 +75,11 @@ class Simulated(SequenceSource):
     def gather(self, split: Split, index: Tensor, length: int) -> SimulatedSequences:
         """Collect sequences by index, int64 (B,), of `length` steps each."""
         drawn = self.trajectories(split, length)
-        return SimulatedSequences(drawn.observation[index].float(), drawn.action[index].float())
+        return SimulatedSequences(*(values[index].float() for values in (drawn.observation, drawn.action, drawn.state)))
 
     def decode(self, compact: SimulatedSequences) -> SequenceBatch:
         """Add the reward, which these processes do not have, and the mask, since every step counts."""
-        observation, action = compact
+        observation, action, state = compact
         shape, device = observation.shape[:2], observation.device
         mask = torch.ones(shape, dtype=torch.bool, device=device)
-        return SequenceBatch(observation, action, torch.zeros(shape, device=device), mask)
+        return SequenceBatch(observation, action, torch.zeros(shape, device=device), mask, state)

@@ -21,6 +21,8 @@ class SequenceBatch(NamedTuple):
     """r_t, float32 (B, T)."""
     mask: Tensor
     """True where the step belongs to the sequence, False on padding, bool (B, T)."""
+    state: Tensor
+    """s_t of the process where the source knows it, float32 (B, T, D), else D = 0; a world model never sees it."""
 
 
 class SequenceSource(ABC):

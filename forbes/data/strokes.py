@@ -141,6 +141,7 @@ class Strokes(SequenceSource):
             action=torch.zeros(batch, length, 0, device=device),
             reward=torch.zeros(batch, length, device=device),
             mask=time * self.points_per_step < number[:, None],  # (B, T)
+            state=torch.zeros(batch, length, 0, device=device),
         )
 
 

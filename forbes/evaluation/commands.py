@@ -45,8 +45,9 @@ certain. So beside it:
   fivo       the sequential Monte-Carlo bound, by K particles, and their effective sample size
   open-loop  log p(rest | beginning), by K futures that start in the belief
 
-Data of a known process add log_p, the exact log p(o_1..T), which no bound exceeds. The last three take the first {_SUBSET} sequences, and their names say so. Writes evaluation.json, and evaluation.npz
-with each sequence's scores, into each run folder. Interrupted, the same command goes on where it stopped."""
+Data of a known process add log_p, the exact log p(o_1..T), which no bound exceeds. pll, fivo and open-loop take the
+first {_SUBSET} sequences, and their names say so. Writes evaluation.json, and evaluation.npz with each sequence's
+scores, into each run folder. Interrupted, the same command goes on where it stopped."""
 
 
 class _Job(NamedTuple):

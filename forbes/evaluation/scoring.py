@@ -5,6 +5,7 @@ import io
 import shutil
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from forbes.models import StateSpaceModel
 from forbes.pomdps import Process
 from forbes.seeding import derive_seed
 
-__all__ = ["PASSES", "Parts", "Pass", "Scores", "exact_pass", "make_pass", "score_split"]
+__all__ = ["PASSES", "Parts", "Pass", "Scores", "exact_pass", "make_pass", "require_finite", "score_split"]
 
 
 class Pass(NamedTuple):
@@ -123,6 +124,8 @@ class Parts:
     def remove(self) -> None:
         """Forget them, once the evaluation is recorded."""
         shutil.rmtree(self.folder, ignore_errors=True)
+        with suppress(OSError):  # other evaluations have parts there
+            self.folder.parent.rmdir()
 
     def _path(self, first: int) -> Path:
         return self.folder / f"{first}.npz"
@@ -156,7 +159,7 @@ def score_split(
             values = parts.read(first) if parts else None
             if values is None:
                 values = _score(model, first, SequenceBatch(*(v.to(device) for v in batch)), score, seed, where)
-                _require_finite(where, first, values)
+                require_finite(where, first, values)
                 if parts:
                     parts.write(first, values)
             found.append(Scores(values, batch.mask))
@@ -189,7 +192,8 @@ def _out_of_memory(error: RuntimeError) -> bool:
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
-def _require_finite(where: str, first: int, scores: Increments) -> None:
+def require_finite(where: str, first: int, scores: Increments) -> None:
+    """Raise a ForbesError that names the first sequence, counted from `first`, with a score that is not finite."""
     for name, values in scores.items():
         broken = torch.nonzero(~values.isfinite().all(1))  # (n, 1)
         if len(broken):

@@ -3,8 +3,10 @@
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import yaml
+from lightning import LightningModule
 from torch import Tensor, nn
 
 from forbes.data import SequenceDataModule
@@ -12,18 +14,31 @@ from forbes.errors import ForbesError
 from forbes.training.checkpoint import read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside
 from forbes.training.configuration import allow_modules, experiment_parser
+from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder
 from forbes.training.world_model import WorldModel
 
-__all__ = ["check_weights", "load_run"]
+__all__ = ["check_weights", "load_known_belief", "load_run"]
+
+Module = TypeVar("Module", bound=LightningModule)
 
 
 def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
-    """Load a run's model, on the CPU and in evaluation mode, and its data, without a Trainer.
+    """Load a run's world model, on the CPU and in evaluation mode, and its data, without a Trainer.
 
     Raises:
-        ForbesError: when the folder holds no trained run, or its configuration and its checkpoint do not fit together.
+        ForbesError: when the folder holds no trained run or one of another kind, or its configuration and its
+            checkpoint do not fit together.
     """
+    return _load(run, WorldModel, "forbes beliefs")
+
+
+def load_known_belief(run: Path | str) -> tuple[KnownBelief, SequenceDataModule]:
+    """Load a run's belief of a known process, otherwise as `load_run`."""
+    return _load(run, KnownBelief, "forbes evaluate")
+
+
+def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, SequenceDataModule]:
     folder = RunFolder.trained(run)
     state = read_checkpoint(folder.checkpoint)["state_dict"]
     config = yaml.safe_load(folder.config.read_text())
@@ -41,6 +56,9 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
         if inner := raised_inside(error):
             raise inner from None
         raise
+    if not isinstance(built.model, kind):
+        found = type(built.model).__name__
+        raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Measure it with: {other} {run}")
     check_weights(built.model, state, str(folder.checkpoint))
     built.model.load_state_dict(state)
     return built.model.eval(), built.data

@@ -47,7 +47,7 @@ class WorldModel(LightningModule):
         seed: of the noise of training and validation.
 
     Raises:
-        ForbesError: when a size, the learning rate or `clip_norm` is not above 0.
+        ForbesError: when a size is below 1, or the learning rate or `clip_norm` below 0.
     """
 
     def __init__(
@@ -74,10 +74,8 @@ class WorldModel(LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        _require_positive(
-            state_dim=state_dim, hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers,
-            learning_rate=learning_rate, clip_norm=clip_norm,
-        )  # fmt: skip
+        _require_at_least(1, state_dim=state_dim, hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers)
+        _require_at_least(0, learning_rate=learning_rate, clip_norm=clip_norm)
         self.model = StateSpaceModel(
             belief,
             encoder(observation_shape),
@@ -159,7 +157,7 @@ class WorldModel(LightningModule):
         self.log_dict({name: value.detach() for name, value in values.items()}, batch_size=count)
 
 
-def _require_positive(**numbers: Any) -> None:
+def _require_at_least(least: float, **numbers: Any) -> None:
     for name, number in numbers.items():
-        if number is None or not number > 0:  # a configuration can say null
-            raise ForbesError(f"WorldModel: {name} is {number}, expected a number above 0")
+        if number is None or not number >= least:  # a configuration can say null
+            raise ForbesError(f"WorldModel: {name} is {number}, expected at least {least}")

@@ -39,6 +39,7 @@ class Numbers(SequenceSource):
             torch.zeros(batch, length, self.action_dim),
             torch.zeros(batch, length),
             torch.ones(batch, length, dtype=torch.bool),
+            torch.zeros(batch, length, 0),
         )
 
 

@@ -20,6 +20,7 @@ def test_a_batch_holds_the_chosen_sequences_of_the_process():
 
     torch.testing.assert_close(batch.observation, drawn.observation[[3, 1]].float(), rtol=0, atol=0)
     torch.testing.assert_close(batch.action, drawn.action[[3, 1]].float(), rtol=0, atol=0)
+    torch.testing.assert_close(batch.state, drawn.state[[3, 1]].float(), rtol=0, atol=0)
     assert batch.observation.shape == (2, 4, *data.observation_shape)
     assert batch.action.shape == (2, 4, data.action_dim)
     assert batch.mask.all()

@@ -45,6 +45,7 @@ def make_batch(sequences=7, actions=2):
         action=torch.randn(sequences, STEPS, actions, generator=generator, dtype=torch.float64),
         reward=torch.zeros(sequences, STEPS),
         mask=torch.arange(STEPS) < length,
+        state=torch.zeros(sequences, STEPS, 0),
     )
 
 
@@ -97,7 +98,7 @@ def test_equals_a_plain_loop_over_sequences_and_steps(likelihood, batch_size, mo
     with torch.no_grad():
         expected = [
             plain_elbo(model, observation, action, int(mask.sum()))
-            for observation, action, _, mask in zip(*batch, strict=True)
+            for observation, action, _, mask, _ in zip(*batch, strict=True)
         ]
     torch.testing.assert_close(scores["elbo"], torch.tensor(expected, dtype=torch.float64))
     torch.testing.assert_close(scores["reconstruction"] - scores["kl"], scores["elbo"])

@@ -20,7 +20,8 @@ def copies(observation, number):
     """The same sequence so many times, as a batch."""
     stored = (observation.float() + 0.5).expand(number, *observation.shape).unflatten(-1, (1, 1, 3))  # (N, T, 1, 1, 3)
     mask = torch.ones(stored.shape[:2], dtype=torch.bool)
-    return SequenceBatch(stored, torch.zeros(*mask.shape, 0), torch.zeros(mask.shape), mask)
+    none = torch.zeros(*mask.shape, 0)
+    return SequenceBatch(stored, none, torch.zeros(mask.shape), mask, none)
 
 
 def known(steps):

@@ -15,7 +15,8 @@ def batches():
     """Two batches of five sequences; the observation is the sequence's number."""
     for first in (0, 5):
         number = torch.arange(first, first + 5).view(5, 1, 1).expand(5, STEPS, 1)
-        yield first, SequenceBatch(number, torch.zeros(5, STEPS, 0), torch.zeros(5, STEPS), torch.ones(5, STEPS) > 0)
+        none, mask = torch.zeros(5, STEPS, 0), torch.ones(5, STEPS) > 0
+        yield first, SequenceBatch(number, none, torch.zeros(5, STEPS), mask, none)
 
 
 def hungry(limit, error):

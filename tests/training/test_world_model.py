@@ -48,6 +48,7 @@ def make_batch(seed=0, batch=BATCH):
         torch.rand(batch, TIME, 1, generator=generator),
         torch.zeros(batch, TIME),
         mask,
+        torch.zeros(batch, TIME, 0),
     )
 
 

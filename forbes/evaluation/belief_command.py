@@ -1,0 +1,193 @@
+"""`forbes beliefs`: how far learned beliefs of a known process are from its exact one."""
+
+import shlex
+import sys
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from typing import Any, NamedTuple, get_args
+
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from forbes.arguments import ArgumentParser, positive
+from forbes.data import SequenceBatch, SequenceDataModule, Split
+from forbes.errors import ForbesError
+from forbes.evaluation.belief_errors import ERRORS, Belief, belief_errors, mode_centres, moment_matched
+from forbes.evaluation.bounds import Increments
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.record import describe, read_record, write_record
+from forbes.evaluation.runs import data_name, data_sha256, split_batches
+from forbes.evaluation.scoring import Scores, require_finite
+from forbes.pomdps import ExactFilter
+from forbes.seeding import derive_seed, generator
+from forbes.training import KnownBelief
+from forbes.training.known_model import has_transition_density
+from forbes.training.loading import load_known_belief
+from forbes.training.provenance import commit
+from forbes.training.run_folder import RunFolder
+
+__all__ = ["main"]
+
+_DESCRIPTION = """\
+Measure how far learned beliefs of a known process are from its exact one.
+
+  forbes fit --config configs/pomdp/mirror_sensor/known_mixture.yaml --run_dir runs/mixture
+  forbes beliefs runs/mixture
+
+Per step, mean and standard error over sequences:
+
+  forward_kl        KL(exact || q) in nats: large where q misses a mode
+  reverse_kl        KL(q || exact) in nats: large where q has mass that should not be there
+  state_nll_regret  log exact(s_t) - log q(s_t) of the true state in nats; its mean is the forward KL
+  variance_ratio    tr Var q / tr Var exact: below 1 where q is too certain
+  mode_mass_error   half the sum over modes of |q - exact|, where the process can have several
+  elbo_gap          (log p(o_1..T) - ELBO) / T in nats, where the process has all densities; a smaller gap is not a
+                    better belief
+
+Below the runs stands the diagonal Gaussian of the exact belief's mean and variance: by the forward KL, the best of its
+family. Where the exact belief is a grid, sums over its cells, elsewhere S samples of both. Writes evaluation.json, and
+evaluation.npz with each sequence's numbers, into each run folder."""
+
+_ROWS = 10  # sequences at a time: on a fine grid half a million cells
+
+
+class _Run(NamedTuple):
+    """A learned belief, in float64 like the exact one, and its data."""
+
+    path: str
+    module: KnownBelief
+    data: SequenceDataModule
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the command with its arguments."""
+    args = _parser().parse_args(argv)
+    runs = [_load(path) for path in args.runs]
+    sha256 = _same_data(runs, args)
+    table = _table(args)
+    for run in runs:
+        began = time.monotonic()
+        scores = _learned(run, args)
+        origin = {
+            "command": shlex.join(["forbes", "beliefs", *argv]),
+            "commit": commit(),
+            "seed": args.seed,
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "data": {"name": data_name(run.data), "sha256": sha256},
+            "checkpoint": RunFolder(run.path).checkpoint_sha256(),
+            "seconds": round(time.monotonic() - began, 1),
+        }
+        names = {metric: _metric_name(run, args, metric) for metric in scores.values}
+        entries = {name: describe(scores, metric) | origin for metric, name in names.items()}
+        write_record(run.path, entries, {name: scores.values[metric].sum(1) for metric, name in names.items()})
+        table.add_row(*_row(run.path, f"{type(run.module.model.head).__name__}, {run.module.objective}", scores))
+    table.add_row(*_row("", "moment-matched Gaussian", _matched(runs[0], args)))
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser("forbes beliefs", _DESCRIPTION)
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made of a KnownBelief")
+    parser.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
+    parser.add_argument("--sequences", type=positive, default=200, help="the first so many (default: 200)")
+    parser.add_argument("--samples", type=positive, default=100, help="S of beliefs and ELBO (default: 100)")
+    parser.add_argument("--seed", type=int, default=0, help="of the samples (default: 0)")
+    return parser
+
+
+def _load(path: str) -> _Run:
+    module, data = load_known_belief(path)
+    module.require_data(data)
+    read_record(path)  # a broken one is said before minutes are spent
+    return _Run(path, module.double(), data)
+
+
+def _same_data(runs: Sequence[_Run], args: Any) -> str:
+    """Give the hash of the sequences; refuse runs with others, or with too few."""
+    hashes = []
+    for run in runs:
+        size = run.data.source.size(args.split)
+        if not 2 <= args.sequences <= size:
+            raise ForbesError(
+                f"--sequences {args.sequences}: the {args.split} split of {run.path} has {size}, expected 2 to that"
+            )
+        hashes.append(data_sha256(run.data, args.split, args.sequences))
+        if hashes[-1] != hashes[0]:
+            raise ForbesError(
+                f"{run.path}: its data are {data_name(run.data)}, those of {runs[0].path} are "
+                f"{data_name(runs[0].data)}, expected the same sequences. Compare runs of the same data"
+            )
+    return hashes[0]
+
+
+def _score(run: _Run, args: Any, compare: Callable[[int, SequenceBatch, ExactFilter], Increments]) -> Scores:
+    """Compare beliefs with the exact ones, some sequences at a time, all in float64."""
+    parts, masks = [], []
+    with torch.random.fork_rng([]), torch.no_grad():
+        for first, batch in split_batches(run.data, args.split, args.sequences, _ROWS):
+            observation, action, state = batch.observation.double(), batch.action.double(), batch.state.double()
+            exact = run.module.process.exact_filter(observation, action)
+            torch.manual_seed(derive_seed(args.seed, "beliefs", first))
+            batch = batch._replace(observation=observation, action=action, state=state)
+            parts.append(compare(first, batch, exact))
+            masks.append(batch.mask)
+    return Scores({name: torch.cat([part[name] for part in parts]) for name in parts[0]}, torch.cat(masks))
+
+
+def _compare(run: _Run, args: Any, first: int, batch: SequenceBatch, exact: ExactFilter, belief: Belief) -> Increments:
+    draw = generator(args.seed, "beliefs", first)
+    return belief_errors(exact.belief, belief, batch.state, mode_centres(run.module.process), args.samples, draw)
+
+
+def _learned(run: _Run, args: Any) -> Scores:
+    """Measure what a run has learned."""
+    model, has_elbo = run.module.model, has_transition_density(run.module.process)
+
+    def compare(first: int, batch: SequenceBatch, exact: ExactFilter) -> Increments:
+        errors = _compare(run, args, first, batch, exact, model.belief(batch.observation, batch.action))
+        if has_elbo:
+            paths = [model.elbo(batch.observation, batch.action, batch.mask) for _ in range(args.samples)]
+            bound = sum((path.reconstruction - path.kl for path in paths), start=torch.zeros(())) / args.samples
+            errors["elbo_gap"] = exact.step_log_likelihood - bound  # (B, T)
+        return errors
+
+    scores = _score(run, args, compare)
+    require_finite(run.path, 0, scores.values)
+    return scores
+
+
+def _matched(run: _Run, args: Any) -> Scores:
+    """Measure the Gaussian of the exact belief's mean and variance."""
+    return _score(
+        run, args, lambda first, batch, exact: _compare(run, args, first, batch, exact, moment_matched(exact.belief))
+    )
+
+
+def _metric_name(run: _Run, args: Any, metric: str) -> str:
+    """Name a metric in full: `test[:200]/forward_kl[S=100]`."""
+    whole = args.sequences == run.data.source.size(args.split)
+    return f"{args.split}{'' if whole else f'[:{args.sequences}]'}/{metric}[S={args.samples}]"
+
+
+def _table(args: Any) -> Table:
+    table = Table(
+        title=f"errors against the exact belief, per step, mean ± standard error over {args.sequences} sequences"
+    )
+    for header in ("run", "belief"):
+        table.add_column(header, overflow="fold")
+    for metric in (*ERRORS, "elbo_gap"):
+        table.add_column(metric, justify="right", no_wrap=True)
+    return table
+
+
+def _row(name: str, belief: str, scores: Scores) -> list[str]:
+    """Give a row of the table; a metric that a process or a belief does not have is left empty."""
+    cells = []
+    for metric in (*ERRORS, "elbo_gap"):
+        values = scores.values.get(metric)
+        each = None if values is None else Estimate.per_step(values.sum(1), scores.steps)
+        cells.append("" if each is None else f"{each.mean:.3f} ± {each.standard_error:.3f}")
+    return [escape(name), belief, *cells]

@@ -1,0 +1,150 @@
+r"""How far a belief is from the exact one, step by step: divergences, a proper score, width, and the mass of each mode.
+
+.. math::
+
+    \mathrm{KL}(p \,\|\, q), \quad \mathrm{KL}(q \,\|\, p), \quad \log p(s_t) - \log q(s_t), \quad
+    \frac{\operatorname{tr} \operatorname{Var} q}{\operatorname{tr} \operatorname{Var} p}, \quad
+    \frac12 \sum_k |q(R_k) - p(R_k)|
+
+p is the exact belief given o_1:t, and q the other. The first is large where q misses a mode, the second where q has
+mass that should not be there; the third, of the true state, has the first as its mean. R_k are the states nearest to
+the k-th of some fixed points, one for each mode, so they are the same for every belief and at every step.
+"""
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from forbes.evaluation.bounds import Increments
+from forbes.pomdps import (
+    ExactBelief,
+    GaussianMixtureBelief,
+    GridBelief,
+    LightDark,
+    MirrorSensor,
+    MountainHike,
+    Process,
+    Ungm,
+)
+from forbes.pomdps.mountain_hike import STARTS
+
+__all__ = ["ERRORS", "Belief", "belief_errors", "mode_centres", "moment_matched"]
+
+ERRORS = ("forward_kl", "reverse_kl", "state_nll_regret", "variance_ratio", "mode_mass_error")
+"""What `belief_errors` gives; all but the ratio are 0 for the exact belief, the ratio is 1."""
+
+
+class Belief(Protocol):
+    """What is compared: a distribution of s_t for every sequence and step, such as any `ExactBelief`."""
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draw s_t, `(count, B, T, D)`."""
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Give its log-density in nats: `(..., B, T, D)` to `(..., B, T)`."""
+
+
+class _Nodes(NamedTuple):
+    """Points with the weights that make a sum over them an expectation under either belief."""
+
+    point: Tensor
+    """`(N, B, T, D)`."""
+    log_ratio: Tensor
+    """log p - log q, `(N, B, T)`."""
+    weight: Tensor
+    """Of p and of q, `(2, N, B, T)`."""
+
+
+def belief_errors(
+    exact: ExactBelief,
+    belief: Belief,
+    state: Tensor,
+    modes: Tensor | None,
+    samples: int,
+    generator: torch.Generator,
+) -> Increments:
+    """Compare a belief with the exact one.
+
+    Where the exact belief is a grid, every expectation is a sum over its cells: without noise, and exact as long as the
+    other belief is no narrower than a cell. That one is taken given that the state is on the grid. Elsewhere both are
+    sampled.
+
+    Args:
+        exact: p, `(B, T)` of them, in float64.
+        belief: q, likewise.
+        state: the true s_t, `(B, T, D)`.
+        modes: a point in each mode, `(K, D)`; None where there is one mode, and then no error of its mass.
+        samples: of each belief.
+        generator: draws them.
+
+    Returns:
+        `ERRORS` by name, `(B, T)` each; KLs and regret in nats.
+    """
+    nodes = _cells(exact, belief) if isinstance(exact, GridBelief) else _draws(exact, belief, samples, generator)
+    of_exact, of_belief = nodes.weight  # 2 x (N, B, T)
+    errors = {
+        "forward_kl": _expectation(of_exact, nodes.log_ratio),
+        "reverse_kl": _expectation(of_belief, -nodes.log_ratio),
+        "state_nll_regret": exact.log_prob(state) - belief.log_prob(state),
+        "variance_ratio": _variance(nodes.point, of_belief) / _variance(nodes.point, of_exact),
+    }
+    if modes is not None:
+        distance = (nodes.point.unsqueeze(-2) - modes).square().sum(-1)  # (N, B, T, K)
+        nearest = distance.argmin(-1, keepdim=True) == torch.arange(len(modes))  # (N, B, T, K)
+        excess = ((of_belief - of_exact).unsqueeze(-1) * nearest).sum(0)  # (B, T, K)
+        errors["mode_mass_error"] = excess.abs().sum(-1) / 2
+    return errors
+
+
+def mode_centres(process: Process) -> Tensor | None:
+    """Give a point in each mode that a belief of the process can have, `(K, D)`, None where it has one.
+
+    The signs that an even sensor cannot see, the two sides of the light, and the corners where a hiker may have started
+    and, with steps of at most 0.05, for long still is.
+    """
+    if isinstance(process, MirrorSensor | Ungm):
+        return torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+    if isinstance(process, LightDark):
+        return torch.tensor([[4.0], [6.0]], dtype=torch.float64)
+    if isinstance(process, MountainHike) and process.start == "multi":
+        return torch.tensor(STARTS["multi"], dtype=torch.float64)
+    return None
+
+
+def moment_matched(exact: ExactBelief) -> GaussianMixtureBelief:
+    """Give the diagonal Gaussian of the same mean and variance: of all diagonal ones that with the least forward KL."""
+    mean = exact.mean.unsqueeze(-2)  # (B, T, 1, D)
+    return GaussianMixtureBelief(mean.new_zeros(mean.shape[:-1]), mean, exact.variance.diag_embed())
+
+
+def _cells(exact: GridBelief, belief: Belief) -> _Nodes:
+    """Take the cells of a grid, by the midpoint rule."""
+    point = exact.centres.expand(exact.log_mass.shape).movedim(-1, 0).unsqueeze(-1)  # (G, B, T, 1)
+    log_exact, log_belief = exact.log_prob(point), belief.log_prob(point)  # 2 x (G, B, T)
+    return _Nodes(point, log_exact - log_belief, torch.stack((log_exact, log_belief)).softmax(1))
+
+
+def _draws(exact: ExactBelief, belief: Belief, samples: int, generator: torch.Generator) -> _Nodes:
+    r"""Draw n points from each belief, and take all of them for both.
+
+    .. math:: E_p f \approx \frac1n \sum_{i=1}^{2n} \frac{p(s_i)}{p(s_i) + q(s_i)}\, f(s_i)
+
+    is unbiased, and no weight exceeds 1/n (the balance heuristic of Veach and Guibas, 1995). The noise of what p and q
+    have in common is the same for both, so two equal beliefs differ by nothing.
+    """
+    point = torch.cat((exact.sample(samples, generator), belief.sample(samples, generator)))  # (2 n, B, T, D)
+    log_density = torch.stack((exact.log_prob(point), belief.log_prob(point)))  # (2, 2 n, B, T)
+    return _Nodes(point, log_density[0] - log_density[1], log_density.softmax(0) / samples)
+
+
+def _expectation(weight: Tensor, values: Tensor) -> Tensor:
+    """Sum over points, `(N, *)` to `(*)`; where the weight is 0 the value may be infinite."""
+    return (weight * values).where(weight > 0, 0.0).sum(0)
+
+
+def _variance(point: Tensor, weight: Tensor) -> Tensor:
+    """Give the trace of the variance, `(N, *, D)` and `(N, *)` to `(*)`."""
+    share = (weight / weight.sum(0)).unsqueeze(-1)  # (N, *, 1)
+    mean = (share * point).sum(0)  # (*, D)
+    return (share * (point - mean).square()).sum((0, -1))
