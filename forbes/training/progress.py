@@ -18,17 +18,17 @@ def progress() -> ProgressBar:
 
 
 class TerminalProgress(RichProgressBar):
-    """Lightning's bar, showing the ELBOs."""
+    """Lightning's bar, showing the objectives."""
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """Give what the bar shows at its right."""
-        return {name: round(value, 1) for name, value in _elbos(trainer).items()}
+        return {name: round(value, 1 if abs(value) >= 100 else 3) for name, value in _objectives(trainer).items()}
 
 
 class PlainProgress(ProgressBar):
     """Prints one line an epoch.
 
-    Updates, time, speed, ELBOs and the time left::
+    Updates, time, speed, objectives and the time left::
 
         epoch 2/20  update 1000/10000  0:01:40  10.0 updates/s  train/elbo[bernoulli,S=1] -240.1  left 0:15:00
     """
@@ -62,13 +62,14 @@ class PlainProgress(ProgressBar):
             f"update {trainer.global_step}" + f"/{total}" * ends,
             str(timedelta(seconds=round(elapsed))),
             f"{rate:.1f} updates/s",
-            *(f"{name} {value:.1f}" for name, value in _elbos(trainer).items()),
+            *(f"{name} {value:.{1 if abs(value) >= 100 else 3}f}" for name, value in _objectives(trainer).items()),
         ]
         if ends:
             fields.append(f"left {timedelta(seconds=round((total - trainer.global_step) / rate))}")
         print("  ".join(fields), flush=True)
 
 
-def _elbos(trainer: Trainer) -> dict[str, float]:
-    """Give the newest ELBO of each split."""
-    return {name: float(value) for name, value in trainer.callback_metrics.items() if "/elbo" in name}
+def _objectives(trainer: Trainer) -> dict[str, float]:
+    """Give the newest ELBO, or loss in nats per step, of each split."""
+    metrics = trainer.callback_metrics.items()
+    return {name: float(value) for name, value in metrics if "/elbo" in name or name.endswith("/loss")}
