@@ -47,7 +47,10 @@ certain. So beside it:
 
 Data of a known process add log_p, the exact log p(o_1..T), which no bound exceeds. pll, fivo and open-loop take the
 first {_SUBSET} sequences, and their names say so. Writes evaluation.json, and evaluation.npz with each sequence's
-scores, into each run folder. Interrupted, the same command goes on where it stopped."""
+scores, into each run folder. Interrupted, the same command goes on where it stopped.
+
+On digit strokes and one core, elbo takes some 4 minutes a run, pll 5, fivo 3, and open-loop 20, in proportion to
+--futures and --digits."""
 
 
 class _Job(NamedTuple):
