@@ -1,5 +1,6 @@
 """The categorical belief of DreamerV2 (Hafner et al., 2021, arXiv 2010.02193)."""
 
+import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
@@ -22,16 +23,20 @@ class CategoricalBelief(BeliefHead):
         state_dim: D, a multiple of `classes`; DreamerV2 has 1024.
         context_dim: C.
         classes: K; 32 as in DreamerV2.
+        kl_balance: :math:`\alpha` in [0, 1], how much of the closed form's gradient trains the prior; 0.8 in
+            DreamerV2. By default each side has its own whole gradient.
 
     Raises:
-        ForbesError: when `state_dim` is no multiple of `classes`.
+        ForbesError: when `state_dim` is no multiple of `classes`, or `kl_balance` is outside [0, 1].
     """
 
-    def __init__(self, state_dim: int, context_dim: int, classes: int = 32) -> None:
+    def __init__(self, state_dim: int, context_dim: int, classes: int = 32, kl_balance: float | None = None) -> None:
         super().__init__(state_dim, context_dim)
         if state_dim % classes:
             raise ForbesError(f"CategoricalBelief: state_dim is {state_dim}, expected a multiple of classes, {classes}")
-        self.classes = classes
+        if kl_balance is not None and not 0 <= kl_balance <= 1:
+            raise ForbesError(f"CategoricalBelief: kl_balance is {kl_balance}, expected 0 to 1. DreamerV2 has 0.8")
+        self.classes, self.kl_balance = classes, kl_balance
         self.logits_of = nn.Linear(context_dim, state_dim)
 
     def log_probabilities(self, context: Tensor) -> Tensor:
@@ -55,15 +60,25 @@ class CategoricalBelief(BeliefHead):
         r"""See `BeliefHead.kl`; the closed form exists between two of the same classes.
 
         .. math:: \sum_{g,k} \pi_{gk} (\log \pi_{gk} - \log \pi^{prior}_{gk})
+
+        With `kl_balance` it has the gradient of :math:`\alpha\, KL(\mathrm{sg}(q) \| p) +
+        (1 - \alpha)\, KL(q \| \mathrm{sg}(p))` (DreamerV2, algorithm 2), and the same value.
         """
         if not isinstance(prior, CategoricalBelief) or prior.classes != self.classes:
             return None
         ours, theirs = self.log_probabilities(context), prior.log_probabilities(prior_context)  # 2 x (*, G, K)
+        if self.kl_balance is not None:
+            ours, theirs = _scale_gradient(ours, 1 - self.kl_balance), _scale_gradient(theirs, self.kl_balance)
         return (ours.exp() * (ours - theirs)).sum((-2, -1))
 
     def _log_probabilities(self, logits: Tensor) -> Tensor:
         variables: Tensor = logits.unflatten(-1, (-1, self.classes))  # (*, G, K)
         return variables.log_softmax(-1)
+
+
+def _scale_gradient(x: Tensor, share: float) -> Tensor:
+    """Give x, with so much of its gradient."""
+    return torch.lerp(x.detach(), x, share)
 
 
 def _draw(log_probability: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:

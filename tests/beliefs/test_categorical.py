@@ -63,6 +63,38 @@ def test_monte_carlo_kl_has_the_mean_gradient_of_the_closed_form():
     assert ((gradients.mean(0) - expected).abs() < 4 * gradients.std(0) / number**0.5).all()
 
 
+@pytest.mark.parametrize("balance", [0.0, 0.5, 0.8, 1.0])
+def test_balanced_kl_has_the_gradient_of_the_two_stopped_kls(balance):
+    """DreamerV2's definition, spelled out with torch.distributions."""
+    plain, prior = head(seed=0), head(seed=1)
+    balanced = CategoricalBelief(12, CONTEXT, 4, kl_balance=balance).double()
+    balanced.load_state_dict(plain.state_dict())
+    context, prior_context = (contexts(5, seed=seed).requires_grad_() for seed in (1, 2))
+    wanted = [context, prior_context, balanced.logits_of.weight, prior.logits_of.weight]
+
+    def stopped(belief, at):
+        return Independent(OneHotCategorical(logits=oracle(belief, at).base_dist.logits.detach()), 1)
+
+    expected = balance * kl_divergence(stopped(balanced, context), oracle(prior, prior_context)) + (
+        1 - balance
+    ) * kl_divergence(oracle(balanced, context), stopped(prior, prior_context))
+    kl = balanced.kl(context, prior, prior_context)
+
+    torch.testing.assert_close(kl, plain.kl(context, prior, prior_context))
+    for ours, theirs in zip(
+        torch.autograd.grad(kl.sum(), wanted),
+        torch.autograd.grad(expected.sum(), wanted, allow_unused=True),
+        strict=True,
+    ):
+        torch.testing.assert_close(ours, torch.zeros_like(ours) if theirs is None else theirs)
+
+
+@pytest.mark.parametrize("balance", [-0.1, 1.1, float("nan")])
+def test_refuses_a_balance_outside_0_to_1(balance):
+    with pytest.raises(ForbesError, match=f"kl_balance is {balance}, expected 0 to 1"):
+        CategoricalBelief(12, CONTEXT, 4, kl_balance=balance)
+
+
 def test_there_is_no_closed_form_between_other_families_or_other_classes():
     context = contexts(2)
 
