@@ -1,0 +1,1 @@
+"""Acting on a belief: λ-returns, actor and critic, and a planner."""

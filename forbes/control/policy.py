@@ -1,0 +1,87 @@
+"""Actor and critic on the features of a belief sample (paper §3.2, appendix; the actor's head is Dreamer's)."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from forbes.models.networks import perceptron
+
+__all__ = ["Actor", "Critic", "TanhNormal"]
+
+_MODE_SAMPLES = 100
+_LOG_2 = math.log(2.0)
+
+
+class TanhNormal:
+    r"""A Gaussian squeezed into (-1, 1), independent over the action's dimensions.
+
+    .. math:: a = \tanh u, \quad u \sim N(\mu, \sigma^2), \qquad
+              \log p(a) = \sum_i \log N(u_i; \mu_i, \sigma_i) - 2\,(\log 2 - u_i - \mathrm{softplus}(-2 u_i))
+
+    The subtracted term is :math:`\log(1 - \tanh^2 u)` in a form that does not round to 0.
+
+    Args:
+        mean: :math:`\mu`, `(*, A)`.
+        std: :math:`\sigma`, `(*, A)`.
+    """
+
+    def __init__(self, mean: Tensor, std: Tensor) -> None:
+        self.mean, self.std = mean, std
+
+    def rsample(self, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+        """Draw a, reparameterised, and log p(a): `(*sample_shape, *, A)` and `(*sample_shape, *)`."""
+        noise = torch.randn((*sample_shape, *self.mean.shape), dtype=self.mean.dtype, device=self.mean.device)
+        before = torch.addcmul(self.mean, self.std, noise)  # (*sample_shape, *, A)
+        density = -0.5 * (noise.square() + math.log(2 * math.pi)) - self.std.log()
+        log_prob = (density - 2 * (_LOG_2 - before - softplus(-2 * before))).sum(-1)  # (*sample_shape, *)
+        return before.tanh(), log_prob
+
+    def mode(self) -> Tensor:
+        """Give the most probable of 100 samples, each distribution's own, `(*, A)`: there is no closed form."""
+        action, log_prob = self.rsample((_MODE_SAMPLES,))
+        best = log_prob.argmax(0)  # (*)
+        return action.gather(0, best[None, ..., None].expand(1, *action.shape[1:])).squeeze(0)  # (*, A)
+
+
+class Actor(nn.Module):
+    r"""The policy q(a | features): a tanh-normal, almost bang-bang at the start (Dreamer, appendix A).
+
+    .. math:: \mu = 5 \tanh(x / 5), \qquad \sigma = \mathrm{softplus}(y + \log(e^5 - 1)) + 10^{-4}
+
+    Args:
+        feature_dim: F.
+        action_dim: A.
+        width: of each hidden layer.
+        layers: hidden layers.
+    """
+
+    def __init__(self, feature_dim: int, action_dim: int, width: int, layers: int) -> None:
+        super().__init__()
+        self.hidden = perceptron(feature_dim, width, layers)
+        self.head = nn.Linear(width, 2 * action_dim)
+
+    def forward(self, features: Tensor) -> TanhNormal:
+        """Give the policy at features, `(*, F)`."""
+        mean, std = self.head(self.hidden(features)).chunk(2, -1)  # 2 x (*, A)
+        return TanhNormal(5 * torch.tanh(mean / 5), softplus(std + math.log(math.expm1(5))) + 1e-4)
+
+
+class Critic(nn.Module):
+    """The value v(features): what the policy earns from there on, discounted.
+
+    Args:
+        feature_dim: F.
+        width: of each hidden layer.
+        layers: hidden layers.
+    """
+
+    def __init__(self, feature_dim: int, width: int, layers: int) -> None:
+        super().__init__()
+        self.net = nn.Sequential(perceptron(feature_dim, width, layers), nn.Linear(width, 1))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Give v, `(*, F)` to `(*)`."""
+        value: Tensor = self.net(features)
+        return value.squeeze(-1)  # (*)

@@ -1,0 +1,88 @@
+"""The actor's distribution against torch.distributions."""
+
+import pytest
+import torch
+from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
+
+from forbes.control.policy import Actor, Critic, TanhNormal
+
+
+def policy(*shape, std=1.0):
+    generator = torch.Generator().manual_seed(0)
+    mean = torch.randn(*shape, 2, generator=generator, dtype=torch.float64)
+    return TanhNormal(mean, torch.full_like(mean, std))
+
+
+def oracle(ours):
+    return TransformedDistribution(Independent(Normal(ours.mean, ours.std), 1), [TanhTransform()])
+
+
+def test_log_probability_is_that_of_a_transformed_gaussian():
+    ours = policy(5)
+    torch.manual_seed(0)
+    action, log_prob = ours.rsample((1000,))
+
+    # atanh loses digits near the border: its error is about 1e-16 / (1 - a²), and |d log p / da| is of that size too
+    inside = action.abs().amax(-1) < 0.9999
+    assert inside.double().mean() > 0.95
+    torch.testing.assert_close(log_prob[inside], oracle(ours).log_prob(action)[inside], rtol=1e-7, atol=1e-7)
+
+
+def test_density_integrates_to_one():
+    ours = TanhNormal(torch.tensor([0.3], dtype=torch.float64), torch.tensor([0.5], dtype=torch.float64))
+    grid = torch.linspace(-1, 1, 20_003, dtype=torch.float64)[1:-1, None]
+
+    total = oracle(ours).log_prob(grid).exp().mean() * 2
+
+    assert abs(total - 1) < 1e-3  # so the oracle is a density; ours agrees with it above
+
+
+def test_log_probability_stays_finite_where_the_action_rounds_to_one():
+    action, log_prob = TanhNormal(torch.full((1,), 40.0), torch.ones(1)).rsample()
+
+    assert action == 1
+    assert torch.isfinite(log_prob)
+
+
+def test_actions_follow_gradients():
+    ours = policy(4)
+    ours.mean.requires_grad_()
+    torch.manual_seed(0)
+    action, _ = ours.rsample()
+
+    (gradient,) = torch.autograd.grad(action.sum(), ours.mean)
+
+    torch.testing.assert_close(gradient, 1 - action.detach() ** 2)
+
+
+def test_the_mode_is_chosen_for_each_row_on_its_own():
+    """Narrow policies, whose mode is near tanh of the mean; one row's choice must not decide for another."""
+    ours = policy(50, std=0.01)
+    torch.manual_seed(0)
+
+    mode = ours.mode()
+
+    # every one of 100 samples is within 5 standard deviations of the mean but with probability 6e-5
+    assert (torch.atanh(mode) - ours.mean).abs().max() < 0.05
+    best = oracle(ours).log_prob(mode)
+    typical = oracle(ours).log_prob(ours.rsample((100,))[0]).mean(0)
+    assert (best > typical).all()
+
+
+def test_the_actor_starts_almost_bang_bang():
+    torch.manual_seed(0)
+    actor = Actor(6, 2, 32, 2)
+
+    action, _ = actor(torch.randn(1000, 6)).rsample()
+
+    assert (action.abs() > 0.9).float().mean() > 0.6
+    assert (action.mean(0).abs() < 0.2).all()
+
+
+@pytest.mark.parametrize("shape", [(1,), (7,), (3, 4)])
+def test_shapes(shape):
+    features = torch.randn(*shape, 6)
+
+    assert Actor(6, 2, 8, 1)(features).rsample((5,))[0].shape == (5, *shape, 2)
+    assert Actor(6, 2, 8, 1)(features).mode().shape == (*shape, 2)
+    assert Critic(6, 8, 1)(features).shape == shape
