@@ -9,6 +9,7 @@ Only the posterior's sample feeds the recurrence. So the time loop holds the tra
 the encoder runs before it, the prior and the decoder after it, once over (B·T).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -166,14 +167,29 @@ class StateSpaceModel(nn.Module):
         Returns:
             T steps after `start`, which itself is not among them.
         """
+        given = iter(action.unbind(1))
+        return self.roll(start, lambda _: next(given), action.shape[1])
+
+    def roll(self, start: State, policy: Callable[[Tensor], Tensor], steps: int) -> Rollout:
+        """Roll the prior on from `start`, each row on its own trajectory and by its own actions.
+
+        Args:
+            start: (h, s), `(B, ...)`.
+            policy: the action in a state, from its features: `(B, H + D)` to `(B, A)`.
+            steps: T; the policy acts in `start` and in all steps but the last.
+
+        Returns:
+            T steps after `start`, which itself is not among them.
+        """
         hidden, state = start
-        sample = self.prior.sampler(Loop(action.shape[1], len(action)))
-        steps: list[tuple[Tensor, Tensor, Tensor]] = []
-        for step_action in action.unbind(1):
-            hidden = self.gru(self.transition(torch.cat((state, step_action), -1)), hidden)
+        sample = self.prior.sampler(Loop(steps, len(state)))
+        made: list[tuple[Tensor, Tensor, Tensor]] = []
+        for _ in range(steps):
+            action = policy(torch.cat((hidden, state), -1))
+            hidden = self.gru(self.transition(torch.cat((state, action), -1)), hidden)
             state, log_prob = sample(self.prior_context(hidden))
-            steps.append((hidden, state, log_prob))
-        return Rollout(*(torch.stack(values, 1) for values in zip(*steps, strict=True)))  # (B, T, ...)
+            made.append((hidden, state, log_prob))
+        return Rollout(*(torch.stack(values, 1) for values in zip(*made, strict=True)))  # (B, T, ...)
 
     def beliefs(self, filtered: Filtered, time: int, samples: int) -> State:
         """Draw N samples of each belief q(s_t | h_t, e_t) at one step: `(N B, ...)`, sample-major."""
@@ -188,7 +204,10 @@ class StateSpaceModel(nn.Module):
 
     def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
         """Estimate the bound with one posterior trajectory per sequence; arguments as in `SequenceBatch`."""
-        filtered = self.filter(self.embed(observation), action)
+        return self.bound(self.filter(self.embed(observation), action), observation, mask)
+
+    def bound(self, filtered: Filtered, observation: Tensor, mask: Tensor) -> ElboTerms:
+        """Estimate the bound with the posterior trajectory of `filter`."""
         prior_context = self.prior_context(filtered.hidden)  # (B, T, C)
         log_likelihood = self.likelihood.log_prob(
             self.decode(filtered.features).float(), self.likelihood.target(observation)
