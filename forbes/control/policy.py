@@ -1,4 +1,4 @@
-"""Actor and critic on the features of a belief sample (paper §3.2, appendix; the actor's head is Dreamer's)."""
+"""Actor, critic and reward on the features of a belief sample (paper §3.2, appendix; the actor's head is Dreamer's)."""
 
 import math
 
@@ -8,7 +8,7 @@ from torch.nn.functional import softplus
 
 from forbes.models.networks import perceptron
 
-__all__ = ["Actor", "Critic", "TanhNormal"]
+__all__ = ["Actor", "ScalarHead", "TanhNormal"]
 
 _MODE_SAMPLES = 100
 _LOG_2 = math.log(2.0)
@@ -68,8 +68,8 @@ class Actor(nn.Module):
         return TanhNormal(5 * torch.tanh(mean / 5), softplus(std + math.log(math.expm1(5))) + 1e-4)
 
 
-class Critic(nn.Module):
-    """The value v(features): what the policy earns from there on, discounted.
+class ScalarHead(nn.Module):
+    """A number of the features: the reward that came with a state, or its value v, what the policy earns from there on.
 
     Args:
         feature_dim: F.
@@ -82,6 +82,6 @@ class Critic(nn.Module):
         self.net = nn.Sequential(perceptron(feature_dim, width, layers), nn.Linear(width, 1))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Give v, `(*, F)` to `(*)`."""
-        value: Tensor = self.net(features)
-        return value.squeeze(-1)  # (*)
+        """Give the number, `(*, F)` to `(*)`."""
+        number: Tensor = self.net(features)
+        return number.squeeze(-1)  # (*)

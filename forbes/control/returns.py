@@ -35,27 +35,30 @@ def lambda_returns(reward: Tensor, value: Tensor, discount: float, lambda_: floa
     return torch.stack(returns[::-1], -1)  # (*, H - 1)
 
 
-def actor_loss(returns: Tensor, discount: float) -> Tensor:
+def actor_loss(returns: Tensor, discount: float, valid: Tensor) -> Tensor:
     r"""Give :math:`-\overline{\gamma^{\tau-1} V_\tau}` over trajectories and states (paper, J_Actor; weights: Dreamer).
 
     Args:
         returns: :math:`V_\tau`, `(*, H - 1)`, differentiable in the actions.
         discount: :math:`\gamma`.
+        valid: True for trajectories that count, `(*)`: those that start on padding do not.
     """
-    return -(_weights(returns, discount) * returns).mean()
+    return -_discounted_mean(returns, discount, valid)
 
 
-def critic_loss(value: Tensor, returns: Tensor, discount: float) -> Tensor:
+def critic_loss(value: Tensor, returns: Tensor, discount: float, valid: Tensor) -> Tensor:
     r"""Give :math:`\overline{\gamma^{\tau-1} \tfrac12 (v_\tau - \mathrm{sg}(V_\tau))^2}` (paper, J_Critic).
 
     Args:
-        value: :math:`v(s_\tau)` of the states that have a return, `(*, H - 1)`; the states are not to be trained.
-        returns: :math:`V_\tau`, `(*, H - 1)`.
+        value: :math:`v(s_\tau)` of the states that have a return, `(*, H - 1)`.
+        returns: :math:`V_\tau`, `(*, H - 1)`; they are not moved.
         discount: :math:`\gamma`.
+        valid: as for `actor_loss`.
     """
-    return (_weights(returns, discount) * 0.5 * (value - returns.detach()).square()).mean()
+    return _discounted_mean(0.5 * (value - returns.detach()).square(), discount, valid)
 
 
-def _weights(returns: Tensor, discount: float) -> Tensor:
-    """Give γ^{τ-1}: how much a state counts that is imagined τ - 1 steps after the first, `(H - 1,)`."""
-    return discount ** torch.arange(returns.shape[-1], device=returns.device, dtype=returns.dtype)
+def _discounted_mean(values: Tensor, discount: float, valid: Tensor) -> Tensor:
+    """Average over trajectories and states; one that is imagined τ - 1 steps after the first counts γ^{τ-1}."""
+    weight = discount ** torch.arange(values.shape[-1], device=values.device, dtype=values.dtype)  # (H - 1,)
+    return ((weight * values).mean(-1) * valid).sum() / valid.sum()

@@ -102,7 +102,7 @@ class StateSpaceModel(nn.Module):
         prior: BeliefFamily | None = None,
     ) -> None:
         super().__init__()
-        self.state_dim, self.hidden_dim = state_dim, hidden_dim
+        self.action_dim, self.state_dim, self.hidden_dim = action_dim, state_dim, hidden_dim
         self.encoder, self.decoder, self.likelihood = encoder, decoder, likelihood
         self.transition = perceptron(state_dim + action_dim, mlp_dim, mlp_layers)
         self.gru = nn.GRUCell(mlp_dim, hidden_dim)

@@ -1,6 +1,7 @@
 """Training: LightningModules that optimise and log."""
 
+from forbes.training.actor_critic import ImaginationActorCritic
 from forbes.training.known_model import KnownBelief
 from forbes.training.world_model import WorldModel
 
-__all__ = ["KnownBelief", "WorldModel"]
+__all__ = ["ImaginationActorCritic", "KnownBelief", "WorldModel"]

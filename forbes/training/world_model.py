@@ -1,11 +1,11 @@
 """The world model as a LightningModule: it optimises and logs; the mathematics is in `forbes.models`."""
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from lightning import LightningModule
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -18,7 +18,15 @@ from forbes.models.networks import ConvDecoder, ConvEncoder, DecoderFamily, Enco
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
 
-__all__ = ["WorldModel"]
+__all__ = ["Group", "WorldModel", "require_at_least"]
+
+
+class Group(NamedTuple):
+    """Parameters that share a learning rate, and whose gradients are clipped together."""
+
+    name: str
+    parameters: list[nn.Parameter]
+    rate: float
 
 
 class WorldModel(LightningModule):
@@ -74,8 +82,10 @@ class WorldModel(LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        _require_at_least(1, state_dim=state_dim, hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers)
-        _require_at_least(0, learning_rate=learning_rate, clip_norm=clip_norm)
+        require_at_least(
+            1, "WorldModel", state_dim=state_dim, hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers
+        )
+        require_at_least(0, "WorldModel", learning_rate=learning_rate, clip_norm=clip_norm)
         self.model = StateSpaceModel(
             belief,
             encoder(observation_shape),
@@ -103,10 +113,14 @@ class WorldModel(LightningModule):
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Give the loss of one update; logs the bound without free nats and its parts, per sequence."""
         terms = self.terms(batch)
+        self._log("train", terms)
+        return self.loss(terms)
+
+    def loss(self, terms: ElboTerms) -> Tensor:
+        """Give the loss of this update in nats per step, a scalar."""
         if self.kl == "monte_carlo":
             terms = terms._replace(analytic_kl=None)
         weight = min(1.0, (self.global_step + 1) / self.kl_warmup) if self.kl_warmup else 1.0
-        self._log("train", terms)
         return elbo_loss(terms, self.free_nats, self.free_nats_per, weight)
 
     def on_validation_epoch_start(self) -> None:
@@ -125,9 +139,14 @@ class WorldModel(LightningModule):
         """Give the bound of each sequence in nats, `(B,)`, with one sample."""
         return self.terms(batch).elbo
 
+    def groups(self) -> list[Group]:
+        """Say which parameters share a learning rate and are clipped together."""
+        return [Group("model", [*self.parameters()], self.learning_rate)]
+
     def configure_optimizers(self) -> Any:
         """Adam with the paper's rate; fused, since a step over many small tensors is bound by calls."""
-        optimizer = Adam(self.parameters(), lr=self.learning_rate, eps=1e-7, fused=True)
+        groups = [{"params": group.parameters, "lr": group.rate} for group in self.groups()]
+        optimizer = Adam(groups, eps=1e-7, fused=True)
         scheduler = LambdaLR(optimizer, self._rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
@@ -142,9 +161,10 @@ class WorldModel(LightningModule):
     def configure_gradient_clipping(
         self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """Clip to `clip_norm` and log the norm before."""
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters(), self.clip_norm, foreach=True)
-        self.log("train/gradient_norm", norm)
+        """Clip each group to `clip_norm` and log the norm before."""
+        for group in self.groups():
+            norm = torch.nn.utils.clip_grad_norm_(group.parameters, self.clip_norm, foreach=True)
+            self.log(f"train/gradient_norm_{group.name}", norm)
 
     def _log(self, split: str, terms: ElboTerms) -> None:
         """Log per-sequence means in nats; the bound's name holds its likelihood and number of samples."""
@@ -157,7 +177,8 @@ class WorldModel(LightningModule):
         self.log_dict({name: value.detach() for name, value in values.items()}, batch_size=count)
 
 
-def _require_at_least(least: float, **numbers: Any) -> None:
+def require_at_least(least: float, where: str, **numbers: Any) -> None:
+    """Raise a ForbesError for the first number that is below `least`, or none at all."""
     for name, number in numbers.items():
         if number is None or not number >= least:  # a configuration can say null
-            raise ForbesError(f"WorldModel: {name} is {number}, expected at least {least}")
+            raise ForbesError(f"{where}: {name} is {number}, expected at least {least}")

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
-from forbes.control.policy import Actor, Critic, TanhNormal
+from forbes.control.policy import Actor, ScalarHead, TanhNormal
 
 
 def policy(*shape, std=1.0):
@@ -85,4 +85,4 @@ def test_shapes(shape):
 
     assert Actor(6, 2, 8, 1)(features).rsample((5,))[0].shape == (5, *shape, 2)
     assert Actor(6, 2, 8, 1)(features).mode().shape == (*shape, 2)
-    assert Critic(6, 8, 1)(features).shape == shape
+    assert ScalarHead(6, 8, 1)(features).shape == shape

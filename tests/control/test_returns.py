@@ -43,17 +43,28 @@ def test_every_trajectory_has_its_own_returns():
 
 def test_losses_discount_what_is_imagined_later():
     """A state τ - 1 steps after the first counts γ^(τ - 1), in both losses (H - 1 = 3)."""
-    value, returns = draw(3)
+    value, returns = draw(1, 3)
+    valid = torch.ones(1, dtype=torch.bool)
 
-    torch.testing.assert_close(actor_loss(returns, GAMMA), -sum(GAMMA**k * returns[k] for k in range(3)) / 3)
-    expected = sum(GAMMA**k * (value[k] - returns[k]) ** 2 / 2 for k in range(3)) / 3
-    torch.testing.assert_close(critic_loss(value, returns, GAMMA), expected)
+    expected = -sum(GAMMA**k * returns[0, k] for k in range(3)) / 3
+    torch.testing.assert_close(actor_loss(returns, GAMMA, valid), expected)
+    expected = sum(GAMMA**k * (value[0, k] - returns[0, k]) ** 2 / 2 for k in range(3)) / 3
+    torch.testing.assert_close(critic_loss(value, returns, GAMMA, valid), expected)
+
+
+def test_trajectories_that_start_on_padding_do_not_count():
+    value, returns = draw(4, 3)
+    valid = torch.tensor([True, False, True, False])
+
+    for loss in (lambda v, r, ok: actor_loss(r, GAMMA, ok), lambda v, r, ok: critic_loss(v, r, GAMMA, ok)):
+        torch.testing.assert_close(loss(value, returns, valid), loss(value[::2], returns[::2], valid[::2]))
 
 
 def test_the_critic_does_not_move_its_targets():
-    value, returns = (x.requires_grad_() for x in draw(3))
+    value, returns = (x.requires_grad_() for x in draw(2, 3))
+    loss = critic_loss(value, returns, GAMMA, torch.ones(2, dtype=torch.bool))
 
-    gradient = torch.autograd.grad(critic_loss(value, returns, GAMMA), (value, returns), allow_unused=True)
+    gradient = torch.autograd.grad(loss, (value, returns), allow_unused=True)
 
     assert gradient[0].abs().min() > 0
     assert gradient[1] is None

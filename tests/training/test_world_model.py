@@ -194,7 +194,7 @@ def test_gradients_are_scaled_to_the_clip_norm_and_the_norm_before_is_logged():
 
     assert free["used_norm"] > 0.1
     assert clipped["used_norm"] == pytest.approx(0.1, rel=1e-4)
-    assert clipped["train/gradient_norm"] == pytest.approx(free["used_norm"], rel=1e-5)
+    assert clipped["train/gradient_norm_model"] == pytest.approx(free["used_norm"], rel=1e-5)
 
 
 def test_adam_has_the_papers_settings_and_every_parameter():

@@ -1,0 +1,209 @@
+"""The actor-critic: whose gradient goes where, when it is Dreamer, and that it learns to act."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.control.imagination import belief_samples
+from forbes.data import SequenceBatch
+from forbes.errors import ForbesError
+from forbes.models import MLPDecoder, MLPEncoder, State, VectorNormal
+from forbes.training import ImaginationActorCritic, WorldModel
+
+BATCH, TIME = 4, 5
+SMALL = {
+    "belief": GaussianBelief,
+    "encoder": partial(MLPEncoder, width=8, layers=1),
+    "decoder": partial(MLPDecoder, width=8, layers=1),
+    "likelihood": VectorNormal(),
+    "observation_shape": (1,),
+    "action_dim": 1,
+    "state_dim": 2,
+    "hidden_dim": 6,
+    "mlp_dim": 8,
+    "mlp_layers": 1,
+    "free_nats": 0.0,
+}
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch):
+    """Without a trainer there is nowhere to log to."""
+    for name in ("log", "log_dict"):
+        monkeypatch.setattr(ImaginationActorCritic, name, lambda *args, **kwargs: None)
+
+
+def agent(seed=0, **options):
+    torch.manual_seed(seed)
+    return ImaginationActorCritic(**{**SMALL, "horizon": 4, "control_dim": 8, **options})
+
+
+def make_batch(batch=BATCH, time=TIME, seed=0):
+    """What an action leads to shows it, o_t = a_{t-1}, and it pays to change: r_t = -o_t o_{t-1}."""
+    generator = torch.Generator().manual_seed(seed)
+    action = 2 * torch.rand(batch, time, 1, generator=generator) - 1
+    action[:, 0] = 0
+    reward = -action[..., 0] * action[..., 0].roll(1, 1)
+    reward[:, 0] = 0
+    mask = torch.ones(batch, time, dtype=torch.bool)
+    return SequenceBatch(action.clone(), action, reward, mask, torch.zeros(batch, time, 0))
+
+
+def loss_of(module, batch):
+    torch.manual_seed(1)
+    return module.training_step(batch, 0)
+
+
+def gradients(loss, modules):
+    parameters = [parameter for module in modules for parameter in module.parameters()]
+    return torch.autograd.grad(loss, parameters, allow_unused=True, retain_graph=True)
+
+
+def test_the_world_model_learns_from_its_own_loss_only():
+    ours, batch = agent(), make_batch()
+    torch.manual_seed(1)
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    terms = ours.model.bound(filtered, batch.observation, batch.mask)
+    reward = torch.distributions.Normal(ours.reward(filtered.features), 1.0).log_prob(batch.reward)
+
+    own = gradients(ours.loss(terms) - reward.mean(), [ours.model, ours.reward])
+    together = gradients(loss_of(ours, batch), [ours.model, ours.reward])
+
+    for a, b in zip(own, together, strict=True):
+        torch.testing.assert_close(a, b)
+        assert a.abs().max() > 0
+
+
+def test_actor_and_critic_learn_each_from_its_own_loss():
+    ours, batch = agent(), make_batch()
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    actor, critic = ours._control_losses(filtered, batch.mask)
+    others = {"actor": [ours.model, ours.reward, ours.critic], "critic": [ours.model, ours.reward, ours.actor]}
+
+    for name, loss in [("actor", actor), ("critic", critic)]:
+        assert all(gradient is None for gradient in gradients(loss, others[name]))
+        assert all(gradient.abs().max() > 0 for gradient in gradients(loss, [getattr(ours, name)]))
+
+
+def test_nothing_stays_frozen():
+    ours = agent()
+    loss_of(ours, make_batch())
+
+    assert all(parameter.requires_grad for parameter in ours.parameters())
+
+
+def test_every_parameter_is_in_one_group():
+    ours = agent()
+    grouped = [parameter for group in ours.groups() for parameter in group.parameters]
+
+    assert len(grouped) == len({id(parameter) for parameter in grouped})
+    assert {id(parameter) for parameter in grouped} == {id(parameter) for parameter in ours.parameters()}
+
+
+@pytest.mark.parametrize("trajectories", [1, 3])
+def test_a_flow_that_is_the_identity_is_dreamer(trajectories):
+    dreamer = agent(kl="monte_carlo", trajectories=trajectories)
+    forbes = agent(kl="monte_carlo", trajectories=trajectories, belief=partial(FlowBelief, layers=2, width=4))
+
+    torch.testing.assert_close(loss_of(forbes, make_batch()), loss_of(dreamer, make_batch()), rtol=1e-6, atol=1e-6)
+
+
+def test_the_first_sample_is_the_path_the_filter_took_and_the_others_differ():
+    model, batch = agent().model, make_batch()
+    filtered = model.filter(model.embed(batch.observation), batch.action)
+
+    one, four = belief_samples(model, filtered, 1), belief_samples(model, filtered, 4)
+
+    torch.testing.assert_close(one, State(filtered.hidden[None], filtered.state[None]))
+    torch.testing.assert_close(four.state[0], filtered.state)
+    assert (four.state[1:] - filtered.state).abs().amin() > 0
+    torch.testing.assert_close(four.hidden, filtered.hidden.expand(4, -1, -1, -1))
+    assert not four.state.requires_grad
+
+
+def test_imagined_rewards_and_values_belong_to_the_states_they_are_of():
+    """The losses, spelled out along one trajectory."""
+    ours, batch = agent(trajectories=1), make_batch(1, 1)
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    torch.manual_seed(3)
+    actor, critic = ours._control_losses(filtered, batch.mask)
+
+    torch.manual_seed(3)
+    belief_samples(ours.model, filtered, 1)
+    state, states = State(filtered.hidden[:, 0], filtered.state[:, 0]), []
+    for _ in range(4):
+        action, _ = ours.actor(torch.cat(state, -1)).rsample()
+        rollout = ours.model.imagine(state, action[:, None])
+        state = State(rollout.hidden[:, 0], rollout.state[:, 0])
+        states.append(torch.cat(state, -1)[0])
+    r, v = [ours.reward(f) for f in states], [ours.critic(f) for f in states]
+    g, l = 0.99, 0.95  # noqa: E741
+    third = r[2] + g * v[3]
+    second = r[1] + g * ((1 - l) * v[2] + l * third)
+    first = r[0] + g * ((1 - l) * v[1] + l * second)
+
+    torch.testing.assert_close(actor, -(first + g * second + g**2 * third) / 3)
+    errors = [(value - target) ** 2 / 2 for value, target in zip(v, (first, second, third), strict=False)]
+    torch.testing.assert_close(critic, (errors[0] + g * errors[1] + g**2 * errors[2]) / 3)
+
+
+def test_what_lies_on_padding_changes_nothing_of_the_control_losses():
+    ours, batch = agent(trajectories=2), make_batch()
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    batch.mask[:, 3:] = False
+    losses = []
+    for rubbish in (9.0, -7.0):
+        padded = type(filtered)(*(values.clone() for values in filtered))
+        for values in padded:
+            values[:, 3:] = rubbish
+        torch.manual_seed(3)
+        losses.append(ours._control_losses(padded, batch.mask))
+
+    torch.testing.assert_close(losses[0], losses[1])
+
+
+@pytest.mark.parametrize(("belief", "trajectories"), [(GaussianBelief, 1), (partial(FlowBelief, layers=1, width=4), 2)])
+def test_learns_the_action_that_pays(belief, trajectories):
+    """What pays depends on what is seen; rewards or actions one step aside would be noise, and teach nothing."""
+    options = {"hidden_dim": 16, "mlp_dim": 16, "control_dim": 16, "horizon": 3, "discount": 0.5}
+    rates = {"learning_rate": 1e-2, "actor_rate": 3e-3, "critic_rate": 3e-3}
+    ours = agent(belief=belief, trajectories=trajectories, **options, **rates)
+    optimizer = ours.configure_optimizers()["optimizer"]
+    for update in range(250):
+        torch.manual_seed(update)
+        optimizer.zero_grad()
+        ours.training_step(make_batch(16, 6, update), 0).backward()
+        optimizer.step()
+
+    with torch.no_grad():
+        batch = make_batch(100, 6, seed=-1)
+        filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+        action, _ = ours.actor(filtered.features).rsample()
+    clear = batch.observation.abs() > 0.3
+
+    assert (action * batch.observation < 0)[clear].float().mean() > 0.9  # half of them without any learning
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"trajectories": 0}, "trajectories is 0, expected at least 1"),
+        ({"horizon": 1}, "horizon is 1, expected at least 2"),
+        ({"actor_rate": float("nan")}, "actor_rate is nan, expected at least 0"),
+        ({"action_dim": 0}, "the data have no actions"),
+    ],
+)
+def test_refuses_what_cannot_be(options, message):
+    with pytest.raises(ForbesError, match=message):
+        agent(**options)
+
+
+def test_without_reward_and_control_it_is_the_world_model():
+    """The same weights, and the same bound."""
+    ours = agent()
+    torch.manual_seed(0)
+    world = WorldModel(**SMALL)
+
+    torch.testing.assert_close(dict(ours.model.state_dict()), dict(world.model.state_dict()))
