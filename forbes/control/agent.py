@@ -1,0 +1,76 @@
+"""An agent in an episode: it filters what it is shown, and acts on its belief."""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from forbes.control.planning import CrossEntropy, plan
+from forbes.control.policy import Actor
+from forbes.models import Filtered, State, StateSpaceModel
+from forbes.seeding import derive_seed
+
+__all__ = ["Agent", "Choice", "explore", "follow_plan", "take_mode"]
+
+Choice: TypeAlias = Callable[[Filtered], Tensor]
+"""What to do at the last step of a filtered history, `(1, 1, …)`: an action, `(1, A)`, in [-1, 1]."""
+
+
+class Agent:
+    r"""Plays one episode: shown o_t, it moves its belief on and gives a_t.
+
+    .. math:: (h_t, s_t) \sim q(\cdot \mid o_{1:t}, a_{1:t-1}), \qquad a_t = \mathrm{choice}(h_t, s_t)
+
+    Args:
+        model: in eval mode.
+        choose: see `Choice`; e.g. `take_mode(actor)`.
+        seed: of everything that is drawn; step t depends on (seed, t) and on what was shown.
+    """
+
+    def __init__(self, model: StateSpaceModel, choose: Choice, seed: int) -> None:
+        self.model, self.choose, self.seed = model, choose, seed
+        self.belief, self.steps = model.initial(1), 0
+        self.action = self.belief.state.new_zeros(1, model.action_dim)
+
+    @torch.no_grad()
+    def __call__(self, observation: NDArray[Any]) -> NDArray[np.float32]:
+        """Act on o_t, in the form it is stored in: `(*O)` to `(A,)`."""
+        device = self.action.device
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(derive_seed(self.seed, "act", self.steps))
+            shown = torch.from_numpy(observation).to(device)[None, None]  # (1, 1, *O)
+            filtered = self.model.filter(self.model.embed(shown), self.action[:, None], self.belief)
+            self.action = self.choose(filtered)
+        self.belief, self.steps = filtered.at(0), self.steps + 1
+        action: NDArray[np.float32] = self.action[0].float().cpu().numpy()
+        return action
+
+
+def take_mode(actor: Actor) -> Choice:
+    """Take the most probable action, as for an evaluation."""
+    return lambda filtered: actor(filtered.features[:, 0]).mode()
+
+
+def explore(actor: Actor, noise: float) -> Choice:
+    """Draw from the policy and add N(0, noise²), clipped to [-1, 1]: how Dreamer collects."""
+
+    def choose(filtered: Filtered) -> Tensor:
+        action, _ = actor(filtered.features[:, 0]).rsample()
+        return (action + noise * torch.randn_like(action)).clamp(-1, 1)
+
+    return choose
+
+
+def follow_plan(model: StateSpaceModel, reward: Callable[[Tensor], Tensor], search: CrossEntropy) -> Choice:
+    """Search anew at each step, every candidate on a sample of the belief of its own (PlaNet)."""
+
+    def choose(filtered: Filtered) -> Tensor:
+        state, _ = model.posterior.rsample(filtered.context[:, 0], (search.candidates,))  # (J, 1, D)
+        hidden = filtered.hidden[:, 0].expand(search.candidates, -1, -1)  # (J, 1, H)
+        start = State(hidden.flatten(0, 1), state.flatten(0, 1))  # (J, H), (J, D)
+        return plan(model, reward, start, model.action_dim, search)
+
+    return choose

@@ -1,0 +1,99 @@
+"""An agent's episode: what it remembers, and what its choices depend on."""
+
+import numpy as np
+import pytest
+import torch
+
+from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.control.agent import Agent, explore, follow_plan, take_mode
+from forbes.control.planning import CrossEntropy
+from forbes.control.policy import Actor
+from forbes.models import MLPDecoder, MLPEncoder, StateSpaceModel, VectorNormal
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
+
+
+def build(belief=GaussianBelief):
+    torch.manual_seed(0)
+    model = StateSpaceModel(belief, MLPEncoder((3,), 8, 1), MLPDecoder(20, (3,), 8, 1), VectorNormal(), 2, 4, 16, 8, 1)
+    return model.eval(), Actor(20, 2, 8, 1)
+
+
+def search():
+    return CrossEntropy(horizon=2, iterations=2, candidates=20, best=5)
+
+
+def choices(model, actor):
+    return {
+        "mode": take_mode(actor),
+        "explore": explore(actor, 0.3),
+        "plan": follow_plan(model, lambda features: features.sum(-1), search()),
+    }
+
+
+@pytest.mark.parametrize("belief", [GaussianBelief, FlowBelief])
+@pytest.mark.parametrize("kind", ["mode", "explore", "plan"])
+def test_an_episode_depends_on_its_seed_only(belief, kind):
+    model, actor = build(belief)
+    choose = choices(model, actor)[kind]
+
+    torch.manual_seed(5)
+    before = torch.random.get_rng_state()
+    first, again, other = (Agent(model, choose, seed) for seed in (1, 1, 2))
+    actions = [[agent(o) for o in OBSERVATIONS] for agent in (first, again, other)]
+
+    np.testing.assert_array_equal(actions[0], actions[1])
+    assert not np.array_equal(actions[0], actions[2])
+    assert np.shape(actions[0]) == (6, 2)
+    assert np.abs(actions[0]).max() <= 1
+    assert np.asarray(actions[0]).dtype == np.float32
+    assert torch.equal(torch.random.get_rng_state(), before)  # and nothing else notices
+
+
+def test_the_belief_is_that_of_filtering_the_whole_episode():
+    """Step by step, the recurrence sees the same states and the actions that were taken."""
+    model, actor = build()
+    seen = []
+
+    def choose(filtered):
+        seen.append(filtered)
+        return take_mode(actor)(filtered)
+
+    agent = Agent(model, choose, seed=1)
+    actions = torch.tensor(np.stack([agent(o) for o in OBSERVATIONS]))
+
+    hidden = torch.zeros(1, 16)
+    state, action = torch.zeros(1, 4), torch.zeros(1, 2)
+    for step, filtered in enumerate(seen):
+        hidden = model.gru(model.transition(torch.cat((state, action), -1)), hidden)
+        torch.testing.assert_close(filtered.hidden[:, 0], hidden)
+        context = model.posterior_context(
+            torch.cat((hidden, model.encoder(torch.tensor(OBSERVATIONS[None, step]))), -1)
+        )
+        torch.testing.assert_close(filtered.context[:, 0], context)
+        state, action = filtered.state[:, 0], actions[None, step]
+
+
+def test_what_was_seen_long_ago_matters():
+    model, actor = build()
+    one, other = (Agent(model, take_mode(actor), seed=1) for _ in range(2))
+    changed = OBSERVATIONS.copy()
+    changed[0] += 3
+
+    for o, other_o in zip(OBSERVATIONS, changed, strict=True):
+        one(o), other(other_o)
+
+    assert (one.belief.hidden - other.belief.hidden).abs().max() > 1e-4
+
+
+def test_exploration_adds_noise_of_its_size_and_stays_in_bounds():
+    """A policy that is almost certain of 0: what is left is the noise."""
+    model, actor = build()
+    torch.nn.init.zeros_(actor.head.weight)
+    actor.head.bias.data = torch.tensor([0.0, 0.0, -50.0, -50.0])  # standard deviation 1e-4
+
+    actions = np.stack([Agent(model, explore(actor, 0.3), seed)(OBSERVATIONS[0]) for seed in range(400)])  # (400, 2)
+
+    assert abs(actions.std() / 0.3 - 1) < 4 / np.sqrt(2 * 800)  # relative s.e. of a standard deviation of 800 draws
+    wild = np.stack([Agent(model, explore(actor, 9.0), seed)(OBSERVATIONS[0]) for seed in range(20)])
+    assert np.abs(wild).max() == 1
