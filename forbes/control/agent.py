@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forbes.control.planning import CrossEntropy, plan
-from forbes.control.policy import Actor
+from forbes.control.policy import Actor, TanhNormal
 from forbes.models import Filtered, State, StateSpaceModel
 from forbes.seeding import derive_seed
 
@@ -51,7 +51,12 @@ class Agent:
 
 def take_mode(actor: Actor) -> Choice:
     """Take the most probable action, as for an evaluation."""
-    return lambda filtered: actor(filtered.features[:, 0]).mode()
+
+    def choose(filtered: Filtered) -> Tensor:
+        policy: TanhNormal = actor(filtered.features[:, 0])
+        return policy.mode()
+
+    return choose
 
 
 def explore(actor: Actor, noise: float) -> Choice:
