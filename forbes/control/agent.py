@@ -63,7 +63,8 @@ def explore(actor: Actor, noise: float) -> Choice:
     """Draw from the policy and add N(0, noise²), clipped to [-1, 1]: how Dreamer collects."""
 
     def choose(filtered: Filtered) -> Tensor:
-        action, _ = actor(filtered.features[:, 0]).rsample()
+        policy: TanhNormal = actor(filtered.features[:, 0])
+        action, _ = policy.rsample()
         return (action + noise * torch.randn_like(action)).clamp(-1, 1)
 
     return choose
