@@ -38,7 +38,9 @@ COMMANDS = {
         "check a filter against its own model", "RUN -o figures", "forbes.figures.calibrate_command:main"
     ),
     "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.figures.commands:main"),
-    "data": Command("fetch, build and look at data", "show strokes -o strokes.png", "forbes.data.commands:main"),
+    "data": Command(
+        "fetch, build, collect and look at data", "show strokes -o strokes.png", "forbes.data.commands:main"
+    ),
     "doctor": Command("say what this machine has and lacks", "", "forbes.doctor:main"),
 }
 

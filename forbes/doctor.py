@@ -5,6 +5,7 @@ import platform
 import shutil
 from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,11 +17,18 @@ import forbes
 from forbes.arguments import ArgumentParser
 from forbes.data.dejong import dejong_path
 from forbes.data.strokes import bundled_path
+from forbes.envs.rendering import BACKENDS, probe_backend
 
 __all__ = ["main"]
 
 REQUIRED = ("torch", "lightning", "jsonargparse", "numpy", "matplotlib", "pandas")
-OPTIONAL = {"scikit-image": "build", "tensorboard": "tracking", "dm-control": "dmc"}
+OPTIONAL = {
+    "scikit-image": "build",
+    "tensorboard": "tracking",
+    "dm-control": "dmc",
+    "mujoco": "dmc",
+    "gymnasium": "gym",
+}
 
 
 class Finding(NamedTuple):
@@ -40,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
         arguments
     )
     table = Table("", Column("found", overflow="fold"), Column("what to do", overflow="fold"), box=None)
-    findings = [*_software(), *_hardware(), *_data()]
+    findings = [*_software(), *_hardware(), *_rendering(), *_data()]
     for finding in findings:
         table.add_row(finding.name, finding.value, finding.remedy)
     Console().print(table)
@@ -72,6 +80,19 @@ def _hardware() -> Iterator[Finding]:
     yield Finding(
         "free disk", f"{free:.1f} GiB here", "make room: a run takes up to 0.1 GiB" if free < 1 else "", free < 0.1
     )
+
+
+def _rendering() -> Iterator[Finding]:
+    """Try every backend, that of MUJOCO_GL first; without dm-control there is nothing to render."""
+    if find_spec("dm_control") is None:
+        return
+    asked = os.environ.get("MUJOCO_GL")
+    if asked:
+        yield Finding("MUJOCO_GL", asked)
+    for backend in dict.fromkeys((asked, *BACKENDS) if asked else BACKENDS):
+        probe = probe_backend(backend)
+        value = probe.problem or f"{probe.renderer}, {probe.frames_per_second:.0f} frames of 64 x 64 a second"
+        yield Finding(f"rendering, {backend}", value, probe.remedy)
 
 
 def _data() -> Iterator[Finding]:

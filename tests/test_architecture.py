@@ -11,15 +11,16 @@ MODULES = sorted(FORBES.rglob("*.py"))
 FOUNDATION = {"errors", "files", "seeding", "arguments", "deferred"}
 BENEATH = {"beliefs", "data", "envs", "models", "control", "pomdps"}  # what training knows
 MAY_IMPORT = {  # besides itself and the foundation
-    **{part: set() for part in (*FOUNDATION, "beliefs", "envs", "pomdps")},
-    "data": {"pomdps"},
+    **{part: set() for part in (*FOUNDATION, "beliefs", "pomdps")},
+    "envs": {"pomdps"},  # the adapter that makes an environment of a process
+    "data": {"pomdps", "envs"},  # processes and played episodes are where sequences come from
     "models": {"beliefs"},
     "control": {"beliefs", "models"},
     "training": BENEATH | {"training.callbacks"},
     "training.callbacks": BENEATH | {"training", "evaluation", "figures"},
     "evaluation": BENEATH | {"training"},
     "figures": BENEATH | {"training", "evaluation"},
-    "doctor": {"data"},
+    "doctor": {"data", "envs"},
     "cli": set(),
     "__main__": {"cli"},
     "__init__": set(),
@@ -57,6 +58,13 @@ def test_a_module_imports_nothing_from_its_right(path):
 def test_evaluation_and_figures_do_not_know_the_trainer(path):
     assert not {name.rpartition(".")[2] for name in imports_of(path)} & {"Trainer", "LightningCLI"}
     assert "forbes.training.commands" not in {name.rpartition(".")[0] for name in imports_of(path)}
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if part_of(name_of(p)) == "envs"], ids=name_of)
+def test_only_one_adapter_knows_the_known_processes(path):
+    parts = {part_of(name) for name in imports_of(path) if name.startswith("forbes.")}
+
+    assert "pomdps" not in parts or path.stem in ("known_process", "tasks")
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name_of)

@@ -3,6 +3,16 @@
 import pytest
 
 from forbes.cli import main
+from forbes.envs.rendering import Probe
+
+PROBES = {"egl": Probe("egl", "llvmpipe (LLVM 15)", 37.6), "osmesa": Probe("osmesa", problem="no libOSMesa")}
+
+
+@pytest.fixture(autouse=True)
+def probes(monkeypatch):
+    """What rendering gives is told, not tried: `tests/envs` tries it."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr("forbes.doctor.probe_backend", lambda name: PROBES.get(name, Probe(name, problem="unknown")))
 
 
 def test_a_machine_that_can_train_is_well(capsys):
@@ -27,3 +37,18 @@ def test_the_doctor_takes_no_arguments(argument, capsys):
     assert main(["doctor", argument]) == 2
 
     assert f"unrecognized arguments: {argument}" in capsys.readouterr().err
+
+
+def test_backends_are_tried_and_a_broken_one_has_its_remedy(capsys, monkeypatch):
+    pytest.importorskip("dm_control")
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("MUJOCO_GL", "wgl")
+
+    assert main(["doctor"]) == 0
+
+    lines = capsys.readouterr().out.splitlines()
+    found = {name: next(line for line in lines if f"rendering, {name}" in line) for name in ("egl", "osmesa", "wgl")}
+    assert "llvmpipe (LLVM 15), 38 frames of 64 x 64 a second" in found["egl"]
+    assert "no libOSMesa" in found["osmesa"]
+    assert "apt-get install libosmesa6" in found["osmesa"]
+    assert "unset MUJOCO_GL" in found["wgl"]

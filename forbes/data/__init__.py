@@ -1,8 +1,9 @@
 """Data: one DataModule, several sources of sequences."""
 
 from forbes.data.datamodule import SequenceDataModule
+from forbes.data.replay import Replay
 from forbes.data.simulated import Simulated
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.strokes import Strokes
 
-__all__ = ["SequenceBatch", "SequenceDataModule", "SequenceSource", "Simulated", "Split", "Strokes"]
+__all__ = ["Replay", "SequenceBatch", "SequenceDataModule", "SequenceSource", "Simulated", "Split", "Strokes"]

@@ -1,10 +1,10 @@
-"""`forbes data …`: build, fetch, compare and look at the data."""
+"""`forbes data …`: build, fetch, compare, collect and look at the data."""
 
 import argparse
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from forbes.data.dejong import dejong_path, verify_dejong
+from forbes.data.episode_commands import add_episode_commands
 from forbes.data.fetch import fetch_dejong
+from forbes.data.pictures import save_picture
 from forbes.data.source import Split
 from forbes.data.stroke_comparison import compare_sets
 from forbes.data.stroke_extraction import extract_strokes, read_mnist
@@ -107,11 +109,7 @@ def show(
         digit = slice(*arrays.offsets[number : number + 2])
         _draw_digit(row, arrays.points[digit].astype(int), arrays.pen_up[digit])
         row[0].set_ylabel(f"{split} {number}: a {arrays.labels[number]}")
-    try:
-        figure.savefig(output, dpi=150)
-    except (OSError, ValueError) as error:
-        raise ForbesError(f"{output}: cannot be written ({error}). Choose another place or end it in .png.") from error
-    print(output)
+    save_picture(figure, output)
 
 
 def _draw_digit(row: Sequence[Axes], points: NDArray[np.int_], pen_up: NDArray[np.bool_]) -> None:
@@ -133,27 +131,28 @@ def _draw_digit(row: Sequence[Axes], points: NDArray[np.int_], pen_up: NDArray[n
         axis.set(xlim=(-0.5, SIDE - 0.5), ylim=(SIDE - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
 
 
-def main(argv: list[str]) -> None:
-    """Run `forbes data …`.
+def main(argv: list[str]) -> int | None:
+    """Run `forbes data …`; 1 where `check` has found damage.
 
     Args:
         argv: What follows `forbes data` on the command line.
     """
     arguments = vars(_parser().parse_args(argv))
     command = arguments.pop("command")
-    command(**arguments)
+    status: int | None = command(**arguments)
+    return status
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="forbes data",
-        description="Build, fetch, compare and look at the data.",
+        description="Build, fetch, compare, collect and look at the data.",
         epilog="examples:",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def add(name: str, function: Callable[..., None], example: str) -> argparse.ArgumentParser:
+    def add(name: str, function: Callable[..., Any], example: str) -> argparse.ArgumentParser:
         summary = (function.__doc__ or "").partition("\n")[0]
         command = commands.add_parser(name, help=summary, description=summary, epilog=f"example: forbes data {example}")
         command.set_defaults(command=function)
@@ -180,4 +179,6 @@ def _parser() -> argparse.ArgumentParser:
     look.add_argument("-o", "--output", type=Path, default=Path("strokes.png"), help="picture to write")
     look.add_argument("--origin", choices=get_args(Origin), default="bundled", help="set of strokes")
     look.add_argument("--path", type=Path, help="read this stroke file instead of the origin's own")
+
+    add_episode_commands(add)
     return parser

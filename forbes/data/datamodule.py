@@ -1,7 +1,6 @@
 """The DataModule: batches of sequences from any source, each a pure function of (seed, update)."""
 
 from collections.abc import Iterator
-from functools import lru_cache
 from typing import Any
 
 import torch
@@ -11,7 +10,6 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError
-from forbes.seeding import generator
 
 __all__ = ["SequenceDataModule"]
 
@@ -31,7 +29,7 @@ class _Batches(IterableDataset[Any]):
 
 
 class _TrainIndices:
-    """Indices of the batches from the trainer's update on: shuffled passes over the split, without replacement."""
+    """Indices of the batches from the trainer's update on, chosen by the source."""
 
     def __init__(self, datamodule: "SequenceDataModule") -> None:
         self.datamodule = datamodule
@@ -95,16 +93,17 @@ class SequenceDataModule(LightningDataModule):
         """A."""
         return self.source.action_dim
 
+    def state_dict(self) -> dict[str, Any]:
+        """Give what a checkpoint must hold for the same batches: how far a growing source was read."""
+        return {} if self.source.watermark is None else {"watermark": self.source.watermark}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """See the sequences that there were at the checkpoint."""
+        self.source.watermark = state_dict["watermark"]
+
     def train_index(self, update: int) -> Tensor:
         """Give the indices of one training batch, `(B,)`, int64."""
-        size = self.source.size("train")
-        if self.batch_size > size:
-            raise ForbesError(
-                f"SequenceDataModule: batch_size is {self.batch_size}, but the training split has {size} sequences. "
-                "Choose a smaller batch_size"
-            )
-        turn, place = divmod(update, size // self.batch_size)
-        return _order(self.seed, turn, size)[place * self.batch_size : (place + 1) * self.batch_size]  # (B,)
+        return self.source.train_index(self.batch_size, self.length, self.seed, update)
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Give `updates_per_epoch` batches, from the trainer's current update on."""
@@ -137,9 +136,3 @@ class SequenceDataModule(LightningDataModule):
     def _loader(self, split: Split, indices: Any) -> DataLoader[Any]:
         # A batch is gathered in less time than a worker process needs to hand it over.
         return DataLoader(_Batches(self.source, split, self.length, indices), batch_size=None)
-
-
-@lru_cache(maxsize=2)
-def _order(seed: int, turn: int, size: int) -> Tensor:
-    """Shuffle a split for one pass over it."""
-    return torch.randperm(size, generator=generator(seed, "order", turn))

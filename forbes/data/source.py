@@ -1,9 +1,14 @@
 """What a data source gives: sequences of observations, addressed by split and index."""
 
 from abc import ABC, abstractmethod
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
+import torch
 from torch import Tensor
+
+from forbes.errors import ForbesError
+from forbes.seeding import generator
 
 __all__ = ["SequenceBatch", "SequenceSource", "Split"]
 
@@ -36,6 +41,8 @@ class SequenceSource(ABC):
     """Shape of one observation, without batch and time."""
     action_dim: int
     """A, 0 for a process without actions."""
+    watermark: int | None = None
+    """Up to where a source that grows was read; a checkpoint keeps it, and a resumed run sets it again."""
 
     @abstractmethod
     def sha256(self) -> str:
@@ -52,3 +59,30 @@ class SequenceSource(ABC):
     @abstractmethod
     def decode(self, compact: Any) -> SequenceBatch:
         """Turn what `gather` returned into a batch, on the device it lies on."""
+
+    def train_index(self, batch_size: int, length: int, seed: int, update: int) -> Tensor:
+        """Give the indices of one training batch, int64 `(B,)`: shuffled passes over the split, without replacement.
+
+        Args:
+            batch_size: B.
+            length: T that `gather` will be asked for.
+            seed: of the order.
+            update: number of the batch; with the seed it determines it.
+
+        Raises:
+            ForbesError: when a batch is larger than the split.
+        """
+        size = self.size("train")
+        if batch_size > size:
+            raise ForbesError(
+                f"SequenceDataModule: batch_size is {batch_size}, but the training split has {size} sequences. "
+                "Choose a smaller batch_size"
+            )
+        turn, place = divmod(update, size // batch_size)
+        return _order(seed, turn, size)[place * batch_size : (place + 1) * batch_size]  # (B,)
+
+
+@lru_cache(maxsize=2)
+def _order(seed: int, turn: int, size: int) -> Tensor:
+    """Shuffle a split for one pass over it."""
+    return torch.randperm(size, generator=generator(seed, "order", turn))

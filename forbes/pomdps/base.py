@@ -80,6 +80,8 @@ class Process(ABC):
     """O."""
     action_dim: int
     """A, 0 for a process without actions."""
+    action_scale: float = 1.0
+    """What an agent's action in [-1, 1]^A is multiplied by."""
 
     @abstractmethod
     def initial(self, like: Tensor) -> Distribution:
@@ -115,6 +117,19 @@ class Process(ABC):
         The product over t is the posterior of the whole path: the optimal proposal, whose weights are all p(o).
         """
         return None
+
+    def reward(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """Give r(s_{t-1}, a_{t-1}, s_t) for `(*, D)`, `(*, A)` and `(*, D)`, `(*)`; it is never seen by the filter.
+
+        Raises:
+            ForbesError: where the process has no rewards.
+        """
+        where = type(self).__name__
+        raise ForbesError(f"{where}: has no rewards, expected a process that gives them. Choose another, or add them")
+
+    def terminal(self, state: Tensor) -> Tensor:
+        """Tell the states after which an agent's episode ends: `(*, D)` to bool `(*)`. `sample` goes on in them."""
+        return torch.zeros(state.shape[:-1], dtype=torch.bool, device=state.device)
 
     def log_likelihood(self, observation: Tensor, action: Tensor) -> Tensor:
         """Give log p(o_1:T | a_1:T-1) in nats, `(B,)`."""

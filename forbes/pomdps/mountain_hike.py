@@ -21,6 +21,12 @@ STARTS: dict[Start, list[list[float]]] = {
     "multi": [[-0.85, -0.85], [0.85, -0.85], [0.85, 0.85]],
 }
 START_STD, TRANSITION_STD, MAX_STEP, BOX_SCALE = 0.1, 0.025, 0.05, 10.0
+RIDGES = [  # centre, standard deviations, weight
+    ((0.5, 0.5), (0.75, 0.1), 1.0),
+    ((0.0, 0.2), (0.1, 0.75), 0.8),
+    ((-0.375, -0.5), (0.75, 0.1), 0.55),
+]
+HEIGHT, SHARPNESS, OUTSIDE, EFFORT = 4.0, 4.0, -6.0, 0.1
 
 
 class MountainHike(Process):
@@ -32,8 +38,10 @@ class MountainHike(Process):
     "single" starts at (-0.85, -0.85) (Igl et al., 2018, arXiv 1806.02426): its belief is a Kalman filter's. "multi"
     starts at one of three corners (Ma et al., 2020, arXiv 2002.09884, `mode: multi`): its belief is exactly a mixture
     of three Gaussians. Numbers are those of `mountainHike.yaml` in both repositories; nothing stops the hiker at the
-    border. Left out: rewards, which would tell about the state, and DPFRL's vector of pure noise. An episode has 75
-    steps there.
+    border. Left out: DPFRL's vector of pure noise. An episode has 75 steps there.
+
+    The reward is high on three ridges that lead from the start to the right, where it is highest (`reward`). It tells
+    about the state; the filter, which is not given it, is exact for whoever does not see it either.
 
     Actions of `sample` are N(0, 0.05² I), independent over time; three in five are longer than a step can be, and cut.
 
@@ -46,6 +54,7 @@ class MountainHike(Process):
     state_dim = 2
     observation_dim = 2
     action_dim = 2
+    action_scale = MAX_STEP
 
     def __init__(self, start: Start = "single", observation_std: float = 0.1) -> None:
         if start not in get_args(Start):
@@ -69,6 +78,24 @@ class MountainHike(Process):
     def emission(self, state: Tensor) -> DiagonalGaussian:
         """See `Process.emission`."""
         return DiagonalGaussian(BOX_SCALE * state, BOX_SCALE * self.observation_std)
+
+    def reward(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        r"""See `Process.reward`: the height of the place (x, y) reached, and the effort, as in both repositories.
+
+        .. math:: r = 4\,(1 - (1 - h)^4) - 4.5 + \tfrac{x + y}{4} - 0.1\,\lVert a \rVert, \qquad
+                  h = \max_k \tfrac{w_k}{3}\, N((x, y); m_k, \mathrm{diag}(\sigma_k^2))
+
+        and -6 in place of the height outside of [-1, 1]^2; a is the action before it is cut.
+        """
+        ridges = []
+        for centre, std, weight in RIDGES:
+            ridge = DiagonalGaussian(next_state.new_tensor(centre), next_state.new_tensor(std))
+            ridges.append(weight / len(RIDGES) * ridge.log_prob(next_state).exp())  # (*)
+        height = HEIGHT * (1 - (1 - torch.stack(ridges).amax(0)) ** SHARPNESS)  # (*)
+        height = height - (HEIGHT + 0.5) + next_state.sum(-1) / 4
+        inside = (next_state.abs() <= 1).all(-1)  # (*)
+        effort: Tensor = EFFORT * torch.linalg.vector_norm(action, dim=-1)  # (*)
+        return torch.where(inside, height, OUTSIDE) - effort
 
     def policy(self, sequences: int, steps: int, generator: torch.Generator) -> Tensor:
         """See `Process.policy`."""

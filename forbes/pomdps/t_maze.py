@@ -25,7 +25,7 @@ class TMaze(FiniteProcess):
 
     With probability :math:`\lambda` an action is replaced by one of the four at random; one that leads into a wall
     has no effect, and L + 1 and L + 2 are never left. Bakker (2001); numbers, observations and policy as in Lambrechts
-    et al. (2022, arXiv 2208.03520, `tmaze.py` of *belief-rnn*). Rewards are left out.
+    et al. (2022, arXiv 2208.03520, `tmaze.py` of *belief-rnn*), who play 3 L / (1 - λ) steps.
 
     State i is at place i mod (L + 3), with the goal up for i < L + 3; actions are right, up, left, down. Those of
     `sample` go right with probability 1/2.
@@ -39,6 +39,7 @@ class TMaze(FiniteProcess):
         require_positive("TMaze", length=length)
         if not 0 <= stochasticity <= 1:
             raise ForbesError(f"TMaze: stochasticity is {stochasticity}, expected a probability. Choose one in [0, 1]")
+        self.length, self.stochasticity = length, stochasticity
         places = length + 3
         walk = torch.stack([one_hot(next_place(length, action), places).double() for action in range(4)])  # (4, P, P)
         walk = (1 - stochasticity) * walk + stochasticity * walk.mean(0)
@@ -53,6 +54,19 @@ class TMaze(FiniteProcess):
             emission=one_hot(seen.flatten(), 4).double(),  # (2 P, 4)
             policy=torch.tensor([3.0, 1.0, 1.0, 1.0], dtype=torch.float64) / 6,
         )
+
+    def reward(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """See `Process.reward`: 4 at the goal, -0.1 at the other end and for standing still, else 0 (`tmaze.py`)."""
+        before, after = state.argmax(-1), next_state.argmax(-1)  # (*)
+        goal = self.length + 1 + torch.tensor([0, self.length + 4], device=state.device)  # up; down, in the second half
+        reached = (after.unsqueeze(-1) == goal).any(-1)  # (*)
+        lost = (before == after) | self.terminal(next_state) & ~reached
+        reward = 4.0 * reached.to(state) - 0.1 * lost.to(state)
+        return reward.where(~self.terminal(state), 0.0)
+
+    def terminal(self, state: Tensor) -> Tensor:
+        """See `Process.terminal`: both ends."""
+        return state.argmax(-1) % (self.length + 3) > self.length
 
 
 def next_place(length: int, action: int) -> Tensor:

@@ -1,6 +1,7 @@
 """The tiger problem: listen at two doors, behind one of which is a tiger."""
 
 import torch
+from torch import Tensor
 
 from forbes.errors import ForbesError
 from forbes.pomdps.hmm import FiniteProcess
@@ -14,7 +15,7 @@ class Tiger(FiniteProcess):
     r"""A tiger behind the left or the right door; listening tells which with probability p.
 
     Opening a door puts the tiger behind a door at random, and what is heard then says nothing. Kaelbling, Littman and
-    Cassandra (1998); p = 0.85. Rewards are left out.
+    Cassandra (1998); p = 0.85.
 
     There, what is heard depends on the action. Here the state remembers whether it was listening, so that it depends
     on the state alone: (left, heard), (right, heard), (left, not heard), (right, not heard). Nothing is heard before
@@ -31,6 +32,7 @@ class Tiger(FiniteProcess):
     def __init__(self, accuracy: float = 0.85) -> None:
         if not 0 <= accuracy <= 1:
             raise ForbesError(f"Tiger: accuracy is {accuracy}, expected a probability. Choose one in [0, 1]")
+        self.accuracy = accuracy
         stays = torch.eye(2, dtype=torch.float64)
         anywhere = torch.full((2, 2), 0.5, dtype=torch.float64)
         nowhere = torch.zeros(2, 2, dtype=torch.float64)
@@ -43,3 +45,10 @@ class Tiger(FiniteProcess):
             emission=torch.cat((heard, anywhere)),  # (4, 2)
             policy=torch.tensor([0.8, 0.1, 0.1], dtype=torch.float64),
         )
+
+    def reward(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """See `Process.reward`: -1 for listening, -100 for the tiger's door, 10 for the other (the paper's)."""
+        left = state.argmax(-1) % 2 == 0  # (*), the tiger
+        door = action.argmax(-1)  # (*)
+        opened = torch.where(left == (door == OPEN_LEFT), -100.0, 10.0)
+        return torch.where(door == LISTEN, -1.0, opened).to(state)

@@ -13,6 +13,7 @@ from lightning.fabric.plugins import CheckpointIO
 from lightning.pytorch.callbacks import Checkpoint
 
 from forbes.errors import ForbesError
+from forbes.files import fsync_folder
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["AtomicCheckpointIO", "SaveLast", "read_checkpoint"]
@@ -41,7 +42,7 @@ class AtomicCheckpointIO(CheckpointIO):
                 os.fsync(file.fileno())
             _verify(temporary)
             temporary.replace(path)
-            _fsync_folder(path.parent)
+            fsync_folder(path.parent)
         except OSError as error:
             temporary.unlink(missing_ok=True)
             raise ForbesError(
@@ -102,12 +103,3 @@ def _verify(path: Path) -> None:
         raise ForbesError(f"{path}: truncated, or no checkpoint at all ({error}). Take another one") from error
     if damaged is not None:
         raise ForbesError(f"{path}: the checkpoint is damaged (wrong checksum of {damaged}). Take another one")
-
-
-def _fsync_folder(folder: Path) -> None:
-    """Make a rename in this folder survive a power loss."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -1,18 +1,16 @@
 """Run folders: everything that one training leaves, in one place that no two processes share."""
 
-import fcntl
 import hashlib
 import json
-import os
-import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import pandas as pd
 
 from forbes.errors import ForbesError
+from forbes.files import locked
 
 __all__ = ["RunFolder", "experiment_name", "read_metrics"]
 
@@ -80,14 +78,7 @@ class RunFolder:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Keep every other process from training in this folder; the system frees it when the process dies."""
-        self.path.mkdir(parents=True, exist_ok=True)
-        with (self.path / ".lock").open("a+") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                file.seek(0)
-                raise ForbesError(f"{self}: {file.read()} trains here. Choose another --run_dir") from error
-            _replace_content(file, f"process {os.getpid()} on {platform.node()}")
+        with locked(self.path, "trains here. Choose another --run_dir"):
             yield
 
 
@@ -129,11 +120,3 @@ def read_metrics(run: Path | str) -> pd.DataFrame:
     table = pd.DataFrame.from_dict(dict(sorted(rows.items())), orient="index")
     table.index.name = "update"
     return table
-
-
-def _replace_content(file: TextIO, content: str) -> None:
-    """Write a small file anew without a new inode, which would lose its lock."""
-    file.seek(0)
-    file.truncate()
-    file.write(content)
-    file.flush()

@@ -1,0 +1,153 @@
+"""`forbes data collect`, `info` and `check`: episodes of an environment, played, counted and verified."""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+
+from forbes.arguments import positive
+from forbes.data.collection import MakePolicy, collect_episodes, random_policy
+from forbes.data.episode_store import EpisodeStore, EpisodeWriter
+from forbes.data.episodes import EpisodeRecord
+from forbes.data.pictures import draw_strips, save_picture
+from forbes.envs import EnvironmentProcess, find_environment
+from forbes.envs.tasks import TASKS
+from forbes.errors import ForbesError
+
+__all__ = ["add_episode_commands", "check", "collect", "info"]
+
+POLICIES: dict[str, MakePolicy] = {"random": random_policy}
+
+
+def collect(task: str, episodes: int, policy: str, output: Path, seed: int, timeout: float, **options: Any) -> None:
+    """Play episodes in a process of its own, and store them; interrupted, it goes on where it stopped.
+
+    Args:
+        task: as `forbes.envs.tasks.TASKS` says.
+        episodes: how many have been stored in the end, those of earlier calls included.
+        policy: who acts.
+        output: folder of the store.
+        seed: episode n is a function of (seed, n).
+        timeout: seconds for each answer of the environment.
+        options: of the environment's constructor; None leaves its default.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    make = find_environment(task, **given)
+    records: list[EpisodeRecord] = []
+    with EpisodeWriter(output) as writer:
+        missing = episodes - writer.watermark
+        if missing > 0:
+            with EnvironmentProcess(make, timeout) as environment:
+                played = collect_episodes(environment, writer, POLICIES[policy], policy, episodes, seed)
+                records += track(played, f"Playing {task}", total=missing)
+    print(f"{output}: {len(records)} episodes stored, {_counts(records)}; {writer.watermark} in all")
+
+
+def info(path: Path, output: Path | None = None) -> None:
+    """Print what a store of episodes holds, and draw the frames of three of them.
+
+    Args:
+        path: folder of the store.
+        output: picture to write, by default `frames.png` in the folder; vectors are not drawn.
+    """
+    store = _opened(path)
+    records = sorted(store.records.values(), key=lambda record: record.total_reward)
+    for name, value in _facts(store, records):
+        print(f"{name:<22}{value}")
+    if len(records[0].environment["observation_shape"]) == 3:
+        chosen = {record.number: record for record in (records[0], records[len(records) // 2], records[-1])}
+        rows = [(f"episode {n}\nreturn {one.total_reward:.1f}", store.episode(n)) for n, one in chosen.items()]
+        save_picture(draw_strips(rows), output or path / "frames.png")
+
+
+def _facts(store: EpisodeStore, records: list[EpisodeRecord]) -> list[tuple[str, str]]:
+    """Say what there is, by name; records in the order of their returns."""
+    returns = np.array([record.total_reward for record in records])
+    facts = [(name, str(value)) for name, value in records[-1].environment.items() if name != "made_by"]
+    made_by = Counter(
+        ", ".join(f"{name} {value}" for name, value in record.environment.get("made_by", {}).items())
+        for record in records
+    )
+    facts += [("made by", f"{text or 'unknown'}: {count} episodes") for text, count in made_by.items()]
+    policies = Counter(record.policy for record in records)
+    facts += [
+        ("policies", ", ".join(f"{name}: {count} episodes" for name, count in policies.items())),
+        (
+            "episodes",
+            f"{len(records)}, of {store.watermark} ever stored; {sum(r.terminated for r in records)} terminated",
+        ),
+        ("steps", _counts(records)),
+        ("on the disk", f"{sum(record.size for record in records) / 2**20:.1f} MiB"),
+        ("return", _spread(returns)),
+    ]
+    rewards, actions = [], []
+    for episode in map(store.episode, store.records):
+        rewards.append(episode.reward[1:].copy())  # a view would keep the file open
+        actions.append(episode.action[1:].copy())
+    facts.append(("reward of a step", _spread(np.concatenate(rewards))))
+    columns = np.concatenate(actions).T  # (A, steps)
+    return facts + [(f"action {place}", _spread(column)) for place, column in enumerate(columns)]
+
+
+def check(path: Path) -> int:
+    """Verify every file of a store of episodes, and put damaged ones aside; 1 if there were any.
+
+    Args:
+        path: folder of the store.
+    """
+    _opened(path)
+    with EpisodeWriter(path) as writer:
+        count, damage = len(writer.records), writer.damage()
+        for number, reason in damage.items():
+            writer.quarantine(number)
+            print(f"{writer.file(number)}: damaged ({reason}), moved to {path / 'quarantine'}")
+    print(f"{path}: {count} episodes read, {count - len(damage)} whole, {len(damage)} damaged")
+    return int(bool(damage))
+
+
+def _opened(path: Path) -> EpisodeStore:
+    """Open a store that has episodes."""
+    store = EpisodeStore(path)
+    if not store.records:
+        raise ForbesError(f"{path}: there are no episodes. Collect some: forbes data collect --task TASK -o {path}")
+    return store
+
+
+def _counts(records: list[EpisodeRecord]) -> str:
+    """Keep the two kinds of steps apart."""
+    steps, frames = sum(record.steps for record in records), sum(record.frames for record in records)
+    return f"{steps:,} agent steps, {frames:,} env steps (frames, with action repeat)"
+
+
+def _spread(values: Any) -> str:
+    return f"{values.min():.3f} to {values.max():.3f}, mean {values.mean():.3f}"
+
+
+def add_episode_commands(add: Callable[[str, Callable[..., Any], str], argparse.ArgumentParser]) -> None:
+    """Add the commands to those of `forbes data`."""
+    example = "collect --task cartpole_swingup --episodes 40 -o episodes/cartpole"
+    play = add("collect", collect, example)
+    play.formatter_class = argparse.RawDescriptionHelpFormatter
+    play.epilog = f"tasks:\n{TASKS}\n\n{play.epilog}"
+    play.add_argument("--task", required=True, help="see below")
+    play.add_argument("--episodes", type=positive, default=10, help="how many DIR has had in the end (10)")
+    play.add_argument("--policy", choices=POLICIES, default="random", help="who acts")
+    play.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the episodes")
+    play.add_argument("--seed", type=int, default=0, help="episode n is a function of the seed and n")
+    play.add_argument("--action-repeat", type=positive, help="frames for which an action is held")
+    play.add_argument("--pixels", action=argparse.BooleanOptionalAction, help="observe images, or what is measured")
+    play.add_argument("--size", type=positive, help="pixels a side (64)")
+    play.add_argument("--camera", type=int, help="number of the camera")
+    play.add_argument("--fast", action="store_const", const=True, help="no shadows, no multisampling: other pixels")
+    play.add_argument("--timeout", type=float, default=60.0, help="seconds for an answer of the environment (60)")
+
+    look = add("info", info, "info episodes/cartpole")
+    look.add_argument("path", type=Path, metavar="DIR", help="folder of the episodes")
+    look.add_argument("-o", "--output", type=Path, help="picture to write, by default DIR/frames.png")
+
+    verify = add("check", check, "check episodes/cartpole")
+    verify.add_argument("path", type=Path, metavar="DIR", help="folder of the episodes")

@@ -1,0 +1,37 @@
+"""Pictures of data: strips of an episode's frames, and how a picture is saved."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from forbes.data.episodes import Episode
+from forbes.errors import ForbesError
+
+__all__ = ["draw_strips", "save_picture"]
+
+_FRAMES = 10
+
+
+def draw_strips(episodes: Sequence[tuple[str, Episode]]) -> Figure:
+    """Draw a row for each episode of images: ten frames, evenly spaced from its first to its last, with their time."""
+    figure = Figure(figsize=(1.0 * _FRAMES, 1.25 * len(episodes)), layout="constrained")
+    axes = figure.subplots(len(episodes), _FRAMES, squeeze=False)
+    for row, (name, episode) in zip(axes, episodes, strict=True):
+        times = np.linspace(0, len(episode.reward) - 1, _FRAMES).round().astype(int)
+        for axis, time in zip(row, times, strict=True):
+            axis.imshow(episode.observation[time].transpose(1, 2, 0))  # (H, W, C)
+            axis.set(xticks=[], yticks=[])
+            axis.set_title(f"t = {time}", fontsize=7)
+        row[0].set_ylabel(name, fontsize=7)
+    return figure
+
+
+def save_picture(figure: Figure, output: Path) -> None:
+    """Write a picture in the format of the path's suffix, and print the path."""
+    try:
+        figure.savefig(output, dpi=150)
+    except (OSError, ValueError) as error:
+        raise ForbesError(f"{output}: cannot be written ({error}). Choose another place or end it in .png.") from error
+    print(output)

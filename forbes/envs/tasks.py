@@ -1,0 +1,73 @@
+"""From the name of a task to its environment."""
+
+import difflib
+import inspect
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+from forbes.envs.base import Environment
+from forbes.envs.control import DeepMindControl
+from forbes.envs.gymnasium import Gymnasium
+from forbes.errors import ForbesError
+
+__all__ = ["TASKS", "find_environment"]
+
+_GYMNASIUM = "gymnasium:"
+_HORIZONS = {"mountain_hike": 75, "multi_start_hike": 75, "t_maze": 30, "tiger": 30}
+"""Steps of an episode: those of DVRL, of DPFRL, 3 L as in belief-rnn; the tiger's is ours."""
+
+TASKS = f"""\
+{", ".join(_HORIZONS)}: processes with an exact belief
+{_GYMNASIUM}ID: any environment of Gymnasium
+CLASS: an Environment of your own, of a module named by --allow-module
+anything else is a task of the DeepMind Control Suite, domain_task: cartpole_swingup, ball_in_cup_catch, walker_walk"""
+
+
+def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
+    """Give what makes the environment of a task; it can be sent to another process.
+
+    Args:
+        task: as `TASKS` says.
+        options: of the environment's constructor.
+
+    Raises:
+        ForbesError: where no environment can be meant, or it has no such option.
+    """
+    own = {kind.__name__: kind for kind in _descendants(Environment) if not kind.__module__.startswith("forbes.")}
+    make: Callable[..., Environment]
+    if task in own:
+        make = own[task]
+    elif task in _HORIZONS:
+        make = partial(_open_process, task)
+    elif task.startswith(_GYMNASIUM):
+        make = partial(Gymnasium, task.removeprefix(_GYMNASIUM))
+    elif near := difflib.get_close_matches(task, [*own, *_HORIZONS], n=1, cutoff=0.8):
+        raise ForbesError(f"{task}: no such task. Did you mean {near[0]}?")
+    else:
+        make = partial(DeepMindControl, task)
+    unknown = options.keys() - inspect.signature(make).parameters.keys()
+    if unknown:
+        raise ForbesError(f"{task}: its environment has no option {min(unknown)}. Leave it out")
+    return partial(make, **options)
+
+
+def _open_process(task: str) -> Environment:
+    """Build a known process where it is used: tensors do not travel, and only here is torch imported."""
+    from forbes import pomdps
+    from forbes.envs.known_process import KnownProcess
+
+    processes: dict[str, Callable[[], pomdps.Process]] = {
+        "mountain_hike": pomdps.MountainHike,
+        "multi_start_hike": partial(pomdps.MountainHike, "multi", observation_std=1.5),
+        "t_maze": pomdps.TMaze,
+        "tiger": pomdps.Tiger,
+    }
+    return KnownProcess(processes[task](), _HORIZONS[task])
+
+
+def _descendants(kind: type) -> Iterator[type]:
+    children: list[type] = kind.__subclasses__()
+    for child in children:
+        yield child
+        yield from _descendants(child)

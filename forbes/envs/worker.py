@@ -1,0 +1,177 @@
+"""A process that owns an environment, so that a simulator that hangs, dies or raises takes nothing with it.
+
+The process is spawned, never forked: OpenGL contexts do not survive a fork, and a renderer in the process that trains
+on a GPU can hang it. Numbers travel as numpy, and torch is not imported there unless the environment does it.
+"""
+
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forbes.envs.base import Environment, Step, check_step
+from forbes.errors import ForbesError
+
+__all__ = ["BrokenEnvironmentError", "EnvironmentProcess"]
+
+START_LIMIT = 180.0
+"""Seconds to import and build an environment; two tries of a renderer, of 60 each, among them."""
+
+
+class BrokenEnvironmentError(ForbesError):
+    """An environment has hung, died, raised or given what is no number: its episode is lost, the next may go well."""
+
+
+class _Facts(NamedTuple):
+    """What the process says of its environment once it is built."""
+
+    observation_shape: tuple[int, ...]
+    action_dim: int
+    discrete: bool
+    action_repeat: int
+    description: dict[str, Any]
+
+
+class _Report(NamedTuple):
+    """What the process says before it ends."""
+
+    sentence: str
+    details: str
+    refused: bool
+    """True for an error the user can mend: to try again is no use."""
+
+
+class EnvironmentProcess(Environment):
+    """An environment in a process of its own, which is started anew for the reset that follows a failure.
+
+    Close it, or use it in a `with` statement. The process ends with its parent, whatever ends that.
+
+    Args:
+        make: makes the environment; what `find_environment` gives, a class, or a `functools.partial` of one.
+        timeout: seconds in which a reset or a step must be answered.
+
+    Raises:
+        BrokenEnvironmentError: where the environment cannot be built.
+        ForbesError: where it says why, in a sentence.
+    """
+
+    def __init__(self, make: Callable[[], Environment], timeout: float = 60.0) -> None:
+        self._make, self._timeout = make, timeout
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._start()
+
+    def reset(self, seed: int) -> Step:
+        """See `Environment.reset`; raises BrokenEnvironmentError."""
+        if self._process is None:
+            self._start()
+        return self._ask("reset", seed)
+
+    def step(self, action: NDArray[np.float32]) -> Step:
+        """See `Environment.step`; raises BrokenEnvironmentError, after which there must be a reset."""
+        if self._process is None:
+            raise BrokenEnvironmentError(f"{self._name}: the episode is broken, expected a reset before the next step")
+        return self._ask("step", action)
+
+    def describe(self) -> dict[str, Any]:
+        """See `Environment.describe`."""
+        return self._description
+
+    def close(self) -> None:
+        """End the process, however busy it is."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._connection.close()
+            self._process = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def _name(self) -> str:
+        return str(self._description["task"]) if hasattr(self, "_description") else "environment"
+
+    def _start(self) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self._connection, theirs = spawn.Pipe()
+        self._process = spawn.Process(target=_serve, args=(theirs, self._make), daemon=True)
+        self._process.start()
+        theirs.close()  # so that the end of the process is the end of the pipe
+        facts: _Facts = self._receive("start", START_LIMIT)
+        self.observation_shape, self.action_dim, self.discrete, self.action_repeat, self._description = facts
+
+    def _ask(self, method: str, argument: Any) -> Step:
+        try:
+            self._connection.send((method, argument))
+        except OSError:  # it has died since its last answer; the pipe still holds why, if it could say so
+            pass
+        step: Step = self._receive(method, self._timeout)
+        return step
+
+    def _receive(self, method: str, timeout: float) -> Any:
+        """Wait for an answer; whatever comes instead ends the process."""
+        try:
+            return self._answer(method, timeout)
+        except BaseException:  # an interrupt, too: the answer it left would be taken for the next one's
+            self.close()
+            raise
+
+    def _answer(self, method: str, timeout: float) -> Any:
+        assert self._process is not None
+        try:
+            if not self._connection.poll(timeout):
+                raise BrokenEnvironmentError(f"{self._name}: it hangs, no answer to {method} within {timeout:g} s")
+            answer = self._connection.recv()
+        except (EOFError, ConnectionError) as error:
+            self._process.join(timeout)
+            status = self._process.exitcode
+            raise BrokenEnvironmentError(
+                f"{self._name}: its process has died in {method}, exit code {status}"
+            ) from error
+        if isinstance(answer, _Report):
+            kind = ForbesError if answer.refused else BrokenEnvironmentError
+            raised = kind(answer.sentence if answer.refused else f"{self._name}: {method} raises {answer.sentence}")
+            raised.add_note(answer.details)
+            raise raised
+        return answer
+
+
+def _serve(connection: Connection, make: Callable[[], Environment]) -> None:
+    """Run in the process: build the environment and answer until the parent is gone or something is wrong."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # a signal to the group is the parent's to handle
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    try:
+        environment = make()
+        shape = tuple(environment.observation_shape)
+        numbers = (environment.action_dim, environment.discrete, environment.action_repeat)
+        connection.send(_Facts(shape, *numbers, environment.describe()))
+        while True:
+            method, argument = connection.recv()
+            step: Step = getattr(environment, method)(argument)
+            check_step(step, shape)
+            connection.send(step)
+    except (EOFError, ConnectionError):
+        pass
+    except Exception as error:
+        refused = isinstance(error, ForbesError)
+        sentence = str(error) if refused else f"{type(error).__name__}: {error}"
+        connection.send(_Report(" ".join(sentence.split()), traceback.format_exc(), refused))
+
+
+def _follow_parent() -> None:
+    """End with the parent, also from within a step that never returns."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

@@ -1,0 +1,50 @@
+"""What all environments share: held actions add up their rewards, and actions are in the units of their bounds."""
+
+import numpy as np
+import pytest
+
+from forbes.envs.base import Step, check_step, repeat, scale_action
+
+SEEN = np.zeros(2, np.float32)
+
+
+def frames(*rewards, terminated=False):
+    """A function that gives a frame each time it is called; the last may end the episode."""
+    steps = [Step(SEEN + time, reward) for time, reward in enumerate(rewards)]
+    steps[-1] = steps[-1]._replace(terminated=terminated)
+    return iter(steps).__next__
+
+
+def test_rewards_and_frames_add_up_and_the_last_observation_is_seen():
+    step = repeat(frames(1.0, 2.0, 4.0, 8.0), 3)
+
+    assert (step.reward, step.frames, step.observation.tolist()) == (7.0, 3, [2.0, 2.0])
+    assert not step.terminated
+
+
+def test_the_end_of_an_episode_is_not_passed():
+    step = repeat(frames(1.0, 2.0, terminated=True), 5)
+
+    assert (step.reward, step.frames, step.terminated) == (3.0, 2, True)
+
+
+def test_an_action_fills_its_bounds_and_is_left_alone_where_there_are_none():
+    low, high = np.array([0.0, -2.0, -np.inf, 1.0]), np.array([4.0, 2.0, np.inf, np.inf])
+
+    for action, expected in ((-1, [0, -2, -1, -1]), (0, [2, 0, 0, 0]), (1, [4, 2, 1, 1])):
+        assert scale_action(np.full(4, action, np.float32), low, high).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("step", "sentence"),
+    [
+        (Step(SEEN, reward=float("inf")), "the reward is inf, expected a finite number"),
+        (Step(SEEN + np.float32(np.inf)), "the observation is not finite"),
+        (Step(np.zeros((3, 8, 8), np.float32)), r"the observation is float32 \(3, 8, 8\), expected float32 \(2,\)"),
+    ],
+)
+def test_what_is_no_step_is_said(step, sentence):
+    check_step(Step(SEEN, 1.0), (2,))
+    check_step(Step(np.zeros((3, 8, 8), np.uint8)), (3, 8, 8))
+    with pytest.raises(ValueError, match=sentence):
+        check_step(step, SEEN.shape)

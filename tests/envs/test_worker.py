@@ -1,0 +1,135 @@
+"""The process that owns an environment: whatever happens in it, the parent gets a sentence and the next episode."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+from toy_environments import Echo, Troubled
+
+from forbes.envs import BrokenEnvironmentError, EnvironmentProcess, find_environment
+from forbes.errors import ForbesError
+
+ACTIONS = [np.array([value], np.float32) for value in (0.5, -0.25, 0.125, 1.0, 0.0, -1.0)]
+
+
+def episode(environment, seed=3):
+    return [environment.reset(seed), *map(environment.step, ACTIONS)]
+
+
+def assert_same(one, other):
+    for ours, theirs in zip(one, other, strict=True):
+        np.testing.assert_array_equal(ours.observation, theirs.observation)
+        assert ours[1:] == theirs[1:]
+
+
+@pytest.fixture(scope="module")
+def echo():
+    with EnvironmentProcess(Echo) as environment:
+        yield environment
+
+
+def test_it_is_the_environment_it_owns(echo):
+    assert (echo.observation_shape, echo.action_dim, echo.discrete, echo.action_repeat) == ((2,), 1, False, 1)
+    assert_same(episode(echo), episode(Echo()))
+
+
+def test_it_lives_elsewhere_and_without_torch(echo):
+    assert echo.describe()["process"] != os.getpid()
+    assert not echo.describe()["torch"]
+
+
+SENTENCES = {
+    "raises": "step raises ArithmeticError: the physics has exploded",
+    "hangs": "it hangs, no answer to step within 2 s",
+    "dies": "its process has died in step, exit code -9",
+    "leaves": "its process has died in step, exit code 7",
+    "rewards_nan": "step raises ValueError: the reward is nan, expected a finite number",
+    "sees_nan": "step raises ValueError: the observation is not finite",
+    "sees_another_shape": "the observation is float32 (3,), expected float32 (2,)",
+    "sees_doubles": "the observation is float64 (2,), expected float32 (2,)",
+}
+
+
+@pytest.mark.parametrize("trouble", SENTENCES)
+def test_after_trouble_the_next_reset_starts_anew(trouble, tmp_path):
+    make = partial(Troubled, trouble, tmp_path / "ledger")
+    with EnvironmentProcess(make, timeout=2.0 if trouble == "hangs" else 60.0) as environment:
+        first = environment.describe()["process"]
+        with pytest.raises(BrokenEnvironmentError) as error:
+            episode(environment)
+        assert str(error.value).startswith("Echo: ")
+        assert str(error.value).endswith(SENTENCES[trouble])
+        with pytest.raises(BrokenEnvironmentError, match="expected a reset before the next step"):
+            environment.step(ACTIONS[0])
+
+        assert_same(episode(environment), episode(Echo()))
+        assert environment.describe()["process"] != first
+
+
+def test_an_interrupt_leaves_no_answer_behind_that_is_taken_for_another(echo, monkeypatch):
+    echo.reset(1)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(echo._connection), "poll", lambda *_: exec("raise KeyboardInterrupt"))
+        with pytest.raises(KeyboardInterrupt):
+            echo.step(ACTIONS[0])
+
+    assert_same(episode(echo), episode(Echo()))
+
+
+def test_an_error_that_a_user_can_mend_is_not_tried_again():
+    with pytest.raises(ForbesError, match="action_repeat is 0, expected at least 1") as error:
+        EnvironmentProcess(partial(find_environment("cartpole_balance"), pixels=False, action_repeat=0))
+    assert not isinstance(error.value, BrokenEnvironmentError)
+    assert "Traceback" in "".join(error.value.__notes__)  # for --debug
+
+
+def gone(process):
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    with open(f"/proc/{process}/stat") as file:  # nobody may be left to collect it
+        return file.read().rpartition(") ")[2].startswith("Z")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_it_ends_with_its_parent_even_within_a_step_that_never_returns(tmp_path):
+    program = """
+import sys
+from functools import partial
+from toy_environments import Troubled
+from forbes.envs import EnvironmentProcess
+if __name__ == "__main__":
+    environment = EnvironmentProcess(partial(Troubled, "hangs", sys.argv[1]))
+    print(environment.describe()["process"], flush=True)
+    environment.reset(0)
+    import numpy
+    for _ in range(3):
+        environment.step(numpy.zeros(1, numpy.float32))
+"""
+    (tmp_path / "parent.py").write_text(program)
+    ledger = tmp_path / "ledger"
+    paths = os.pathsep.join(path for path in sys.path if path)
+    parent = subprocess.Popen(
+        [sys.executable, str(tmp_path / "parent.py"), str(ledger)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": paths},
+    )
+    with parent:
+        child = int(parent.stdout.readline())
+        while not ledger.exists():  # it has begun to hang
+            time.sleep(0.05)
+        parent.send_signal(signal.SIGKILL)
+
+    deadline = time.monotonic() + 30
+    while not (ended := gone(child)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    if not ended:
+        os.kill(child, signal.SIGKILL)
+    assert ended

@@ -1,0 +1,95 @@
+"""Environments of a few lines, for what goes wrong and for what must come out; spawned processes import this module."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from forbes.envs.base import Environment, Step
+
+
+class Echo(Environment):
+    """The next observation and reward are the action; the second number of the observation is the time."""
+
+    observation_shape, action_dim = (2,), 1
+
+    def __init__(self, steps=6, ends=False):
+        self.steps, self.ends = steps, ends
+
+    def reset(self, seed):
+        self.time = 0
+        return Step(np.array([seed % 97, 0], np.float32))
+
+    def step(self, action):
+        self.time += 1
+        done = self.time == self.steps
+        seen = np.array([action[0], self.time], np.float32)
+        return Step(seen, float(action[0]), done and self.ends, done and not self.ends, frames=3)
+
+    def describe(self):
+        return {"task": "Echo", "torch": "torch" in sys.modules, "process": os.getpid()}
+
+
+class Troubled(Echo):
+    """An echo that goes wrong at its third step, `times` times in all; `ledger` is a file that counts them."""
+
+    def __init__(self, trouble, ledger, times=1):
+        super().__init__()
+        self.trouble, self.ledger, self.times = trouble, Path(ledger), times
+
+    def step(self, action):
+        step = super().step(action)
+        if self.time == 3 and self.count() < self.times:
+            with self.ledger.open("a") as file:
+                file.write("x")
+            return getattr(self, self.trouble)(step)
+        return step
+
+    def count(self):
+        return len(self.ledger.read_text()) if self.ledger.exists() else 0
+
+    def raises(self, step):
+        raise ArithmeticError("the physics\nhas exploded")
+
+    def hangs(self, step):
+        time.sleep(3600)
+
+    def dies(self, step):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def leaves(self, step):
+        os._exit(7)
+
+    def rewards_nan(self, step):
+        return step._replace(reward=float("nan"))
+
+    def sees_nan(self, step):
+        return step._replace(observation=np.array([np.nan, 0], np.float32))
+
+    def sees_another_shape(self, step):
+        return step._replace(observation=np.zeros(3, np.float32))
+
+    def sees_doubles(self, step):
+        return step._replace(observation=np.zeros(2))
+
+
+class Pictures(Environment):
+    """A white square that moves to the right; its column is the time."""
+
+    observation_shape, action_dim = (3, 8, 8), 2
+
+    def reset(self, seed):
+        self.time = 0
+        return Step(self.picture())
+
+    def step(self, action):
+        self.time += 1
+        return Step(self.picture(), 1.0, truncated=self.time == 4)
+
+    def picture(self):
+        frame = np.zeros((3, 8, 8), np.uint8)
+        frame[:, 2, self.time] = 255
+        return frame
