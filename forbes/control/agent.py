@@ -13,7 +13,7 @@ from forbes.control.policy import Actor, TanhNormal
 from forbes.models import Filtered, State, StateSpaceModel
 from forbes.seeding import derive_seed
 
-__all__ = ["Agent", "Choice", "explore", "follow_plan", "take_mode"]
+__all__ = ["Agent", "Choice", "explore", "follow_plan", "noisy", "take_mode"]
 
 Choice: TypeAlias = Callable[[Filtered], Tensor]
 """What to do at the last step of a filtered history, `(1, 1, …)`: an action, `(1, A)`, in [-1, 1]."""
@@ -60,14 +60,23 @@ def take_mode(actor: Actor) -> Choice:
 
 
 def explore(actor: Actor, noise: float) -> Choice:
-    """Draw from the policy and add N(0, noise²), clipped to [-1, 1]: how Dreamer collects."""
+    """Draw from the policy, and add noise: how Dreamer collects."""
 
     def choose(filtered: Filtered) -> Tensor:
         policy: TanhNormal = actor(filtered.features[:, 0])
-        action, _ = policy.rsample()
+        return policy.rsample()[0]
+
+    return noisy(choose, noise)
+
+
+def noisy(choose: Choice, noise: float) -> Choice:
+    """Add N(0, noise²) to a choice, and clip to [-1, 1]."""
+
+    def choose_nearby(filtered: Filtered) -> Tensor:
+        action = choose(filtered)
         return (action + noise * torch.randn_like(action)).clamp(-1, 1)
 
-    return choose
+    return choose_nearby
 
 
 def follow_plan(model: StateSpaceModel, reward: Callable[[Tensor], Tensor], search: CrossEntropy) -> Choice:

@@ -1,9 +1,19 @@
 """Data: one DataModule, several sources of sequences."""
 
 from forbes.data.datamodule import SequenceDataModule
+from forbes.data.experience import Experience
 from forbes.data.replay import Replay
 from forbes.data.simulated import Simulated
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.strokes import Strokes
 
-__all__ = ["Replay", "SequenceBatch", "SequenceDataModule", "SequenceSource", "Simulated", "Split", "Strokes"]
+__all__ = [
+    "Experience",
+    "Replay",
+    "SequenceBatch",
+    "SequenceDataModule",
+    "SequenceSource",
+    "Simulated",
+    "Split",
+    "Strokes",
+]

@@ -2,6 +2,7 @@
 
 from forbes.training.actor_critic import ImaginationActorCritic
 from forbes.training.known_model import KnownBelief
+from forbes.training.planning_agent import PlanningAgent
 from forbes.training.world_model import WorldModel
 
-__all__ = ["ImaginationActorCritic", "KnownBelief", "WorldModel"]
+__all__ = ["ImaginationActorCritic", "KnownBelief", "PlanningAgent", "WorldModel"]

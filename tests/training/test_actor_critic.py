@@ -79,7 +79,7 @@ def test_the_world_model_learns_from_its_own_loss_only():
 def test_actor_and_critic_learn_each_from_its_own_loss():
     ours, batch = agent(), make_batch()
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
-    actor, critic = ours._control_losses(filtered, batch.mask)
+    actor, critic = ours.control_losses(filtered, batch.mask)
     others = {"actor": [ours.model, ours.reward, ours.critic], "critic": [ours.model, ours.reward, ours.actor]}
 
     for name, loss in [("actor", actor), ("critic", critic)]:
@@ -128,7 +128,7 @@ def test_imagined_rewards_and_values_belong_to_the_states_they_are_of():
     ours, batch = agent(trajectories=1), make_batch(1, 1)
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     torch.manual_seed(3)
-    actor, critic = ours._control_losses(filtered, batch.mask)
+    actor, critic = ours.control_losses(filtered, batch.mask)
 
     torch.manual_seed(3)
     belief_samples(ours.model, filtered, 1)
@@ -149,7 +149,7 @@ def test_imagined_rewards_and_values_belong_to_the_states_they_are_of():
     torch.testing.assert_close(critic, (errors[0] + g * errors[1] + g**2 * errors[2]) / 3)
 
 
-def test_what_lies_on_padding_changes_nothing_of_the_control_losses():
+def test_what_lies_on_padding_changes_nothing_of_thecontrol_losses():
     ours, batch = agent(trajectories=2), make_batch()
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     batch.mask[:, 3:] = False
@@ -159,7 +159,7 @@ def test_what_lies_on_padding_changes_nothing_of_the_control_losses():
         for values in padded:
             values[:, 3:] = rubbish
         torch.manual_seed(3)
-        losses.append(ours._control_losses(padded, batch.mask))
+        losses.append(ours.control_losses(padded, batch.mask))
 
     torch.testing.assert_close(losses[0], losses[1])
 

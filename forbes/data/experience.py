@@ -1,0 +1,143 @@
+"""Episodes that an agent plays while it learns: an environment, the store they go to, and the windows drawn from it."""
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from forbes.data.collection import MakePolicy, collect_episodes
+from forbes.data.episode_store import EpisodeWriter
+from forbes.data.episodes import EpisodeRecord
+from forbes.data.replay import Replay, Windows
+from forbes.data.source import SequenceBatch, SequenceSource, Split
+from forbes.envs import EnvironmentProcess, find_environment
+from forbes.errors import ForbesError
+
+__all__ = ["Experience"]
+
+
+class Experience(SequenceSource):
+    """What an agent has lived through so far: a `Replay` that begins empty and grows by `collect`.
+
+    All episodes are of the training split. A checkpoint keeps the watermark; a run that goes on from it puts later
+    episodes aside, and plays them anew.
+
+    Args:
+        task: as for `forbes data collect`: `cartpole_swingup`, `mountain_hike`, `gymnasium:ID`, a class of your own.
+        options: of its environment, e.g. `{pixels: false, action_repeat: 4}`.
+        capacity: agent steps of the latest episodes that are drawn from; None draws from all.
+
+    Raises:
+        ForbesError: for an unknown task or option.
+    """
+
+    def __init__(self, task: str, options: dict[str, Any] | None = None, capacity: int | None = None) -> None:
+        self.task, self.options, self.capacity = task, options or {}, capacity
+        self._make = find_environment(task, **self.options)
+        self._writer: EpisodeWriter | None = None
+        self._replay: Replay | None = None
+
+    @cached_property
+    def environment(self) -> EnvironmentProcess:
+        """The environment, in a process that starts when it is first asked for."""
+        return EnvironmentProcess(self._make)
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:  # type: ignore[override]
+        """See `SequenceSource`."""
+        return self.environment.observation_shape
+
+    @property
+    def action_dim(self) -> int:  # type: ignore[override]
+        """See `SequenceSource`."""
+        return self.environment.action_dim
+
+    def open(self, folder: Path) -> None:
+        """Keep the episodes in a folder, which no other process may write to until `close`."""
+        self._writer = EpisodeWriter(folder).__enter__()
+        self._look()
+
+    def close(self) -> None:
+        """Leave the folder and end the environment; to be asked for its numbers is to start it anew."""
+        if self._writer is not None:
+            self._writer.__exit__()
+            self._writer = None
+        if "environment" in self.__dict__:
+            self.environment.close()
+            del self.environment
+
+    def collect(self, until: int, make_policy: MakePolicy, policy: str, seed: int) -> Iterator[EpisodeRecord]:
+        """Play until there have been so many episodes; episode n depends on (seed, n) and the policy only.
+
+        Args:
+            until: episodes, those there are included.
+            make_policy: makes the policy of an episode.
+            policy: its name, for the record.
+            seed: of episodes and policies.
+        """
+        for record in collect_episodes(self.environment, self._open(), make_policy, policy, until, seed):
+            self._look()
+            yield record
+
+    @property
+    def env_steps(self) -> int:
+        """Frames of the simulator so far, action repeat included."""
+        return sum(record.frames for record in self._open().records.values())
+
+    @property
+    def agent_steps(self) -> int:
+        """Actions so far."""
+        return sum(record.steps for record in self._open().records.values())
+
+    @property
+    def watermark(self) -> int | None:
+        """How many episodes there have been; to set it to fewer puts the later ones aside."""
+        return None if self._writer is None else self._writer.watermark
+
+    @watermark.setter
+    def watermark(self, value: int | None) -> None:
+        if value is not None:
+            self._open().set_aside(value)
+            self._look()
+
+    def sha256(self) -> str:
+        """Hash the episodes that there are."""
+        return self._replay.sha256() if self._replay else ""
+
+    def size(self, split: Split) -> int:
+        """Count the windows of a split; held-out ones are none."""
+        return self._replay.size(split) if self._replay else 0
+
+    def train_index(self, batch_size: int, length: int, seed: int, update: int) -> Tensor:
+        """See `Replay.train_index`."""
+        return self._drawn().train_index(batch_size, length, seed, update)
+
+    def gather(self, split: Split, index: Tensor, length: int) -> Windows:
+        """See `Replay.gather`."""
+        return self._drawn().gather(split, index, length)
+
+    def decode(self, compact: Windows) -> SequenceBatch:
+        """See `Replay.decode`."""
+        return self._drawn().decode(compact)
+
+    def _look(self) -> None:
+        """Draw from what is there now."""
+        writer = self._open()
+        if not writer.records:
+            self._replay = None
+        elif self._replay is None:
+            self._replay = Replay(str(writer.path), self.capacity, hold_out=0)
+        else:
+            self._replay.refresh()
+
+    def _open(self) -> EpisodeWriter:
+        if self._writer is None:
+            raise ForbesError(f"Experience: the episodes of {self.task} are not open, expected a running `forbes fit`")
+        return self._writer
+
+    def _drawn(self) -> Replay:
+        if self._replay is None:
+            raise ForbesError(f"Experience: there are no episodes of {self.task} yet. Add the callback Collect")
+        return self._replay

@@ -1,0 +1,67 @@
+"""What agents have in common: a world model that knows rewards too, and a choice of actions."""
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any
+
+from torch import Tensor
+
+from forbes.control.agent import Choice
+from forbes.control.policy import ScalarHead
+from forbes.data import SequenceBatch
+from forbes.errors import ForbesError
+from forbes.models import Filtered
+from forbes.models.elbo import ElboTerms
+from forbes.training.world_model import WorldModel, require_at_least
+
+__all__ = ["ActingModel"]
+
+
+class ActingModel(WorldModel, ABC):
+    r"""A world model with rewards: :math:`p(r_t \mid f_t) = N(\hat r(f_t), 1)` with the features :math:`f = [h, s]`.
+
+    .. math:: L_{model} = -J_{Model} - \overline{\log p(r_t \mid f_t)}
+
+    Args:
+        control_dim: width of the reward's perceptron, and of what else acts.
+        control_layers: hidden layers of each.
+        exploration: standard deviation of the noise on the actions of collected episodes.
+        **world: arguments of `WorldModel`.
+
+    Raises:
+        ForbesError: when a size is below 1, the noise below 0, or the data have no actions.
+    """
+
+    def __init__(self, control_dim: int = 200, control_layers: int = 2, exploration: float = 0.3, **world: Any) -> None:
+        super().__init__(**world)
+        name = type(self).__name__
+        require_at_least(1, name, control_dim=control_dim, control_layers=control_layers)
+        require_at_least(0, name, exploration=exploration)
+        if self.model.action_dim == 0:
+            raise ForbesError(
+                f"{name}: the data have no actions, expected some. Choose another source, or a WorldModel"
+            )
+        self.exploration = exploration
+        self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, control_layers)
+
+    @abstractmethod
+    def choose(self, exploring: bool) -> Choice:
+        """Give how to act: with exploration, to learn from it, or as well as the agent can."""
+
+    def explain(self, batch: SequenceBatch) -> tuple[Filtered, ElboTerms, Tensor]:
+        """Filter a batch; give the trajectory, the parts of the bound, and log p(r_t | f_t) in nats, `(B, T)`."""
+        filtered = self.model.filter(self.model.embed(batch.observation), batch.action)
+        error = self.reward(filtered.features) - batch.reward  # (B, T)
+        terms = self.model.bound(filtered, batch.observation, batch.mask)
+        return filtered, terms, -0.5 * (error.square() + math.log(2 * math.pi))
+
+    def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
+        """Give the loss of one update of the world model; logs its parts."""
+        return self.model_loss(*self.explain(batch)[1:])
+
+    def model_loss(self, terms: ElboTerms, reward: Tensor) -> Tensor:
+        """Give the loss of model and reward in nats per step, and log it."""
+        self._log("train", terms)
+        reward_mean = terms.mean_over_steps(reward)
+        self.log("train/reward", reward_mean.detach())
+        return self.loss(terms) - reward_mean

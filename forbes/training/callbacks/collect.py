@@ -1,0 +1,113 @@
+"""An agent that learns plays: seed episodes at random, then one by its own policy before every epoch."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import cast
+
+from lightning import Callback, LightningModule, Trainer
+
+from forbes.control.agent import Agent
+from forbes.data import Experience
+from forbes.data.collection import MakePolicy, play, random_policy
+from forbes.errors import ForbesError
+from forbes.seeding import derive_seed
+from forbes.training.acting import ActingModel
+
+__all__ = ["Collect"]
+
+
+class Collect(Callback):
+    r"""Collects the episodes that an agent learns from, and measures how it does.
+
+    When epoch e begins, S + e episodes have been played: S by a random policy, the others by the agent as it then was,
+    with exploration. Episode n is a function of (seed, n) and the weights, so that a resumed run plays the same.
+    The store is the run folder's `episodes/`.
+
+    Logs, at the end of the epoch: `env_steps` (frames of the simulator, action repeat included), `agent_steps`,
+    `return/exploring` of the newest episode, and `return/acting`, the mean return of episodes without exploration.
+
+    Args:
+        seed_episodes: S.
+        evaluate_every: epochs between two evaluations, of which the last epoch has one.
+        evaluation_episodes: of each; their seeds are those of no other episode, and the same each time.
+        seed: of all the episodes.
+
+    Raises:
+        ForbesError: where a number is below 1; in a fit, where model or data are not those of an agent.
+    """
+
+    def __init__(
+        self, seed_episodes: int = 5, evaluate_every: int = 10, evaluation_episodes: int = 1, seed: int = 0
+    ) -> None:
+        numbers = {"seed_episodes": seed_episodes, "evaluate_every": evaluate_every}
+        for name, value in (numbers | {"evaluation_episodes": evaluation_episodes}).items():
+            if value < 1:
+                raise ForbesError(f"Collect: {name} is {value}, expected at least 1")
+        self.seed_episodes, self.seed = seed_episodes, seed
+        self.evaluate_every, self.evaluation_episodes = evaluate_every, evaluation_episodes
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Open the store, before a checkpoint says how far it had come."""
+        _require_agent(trainer, pl_module)
+        if stage == "fit":
+            _experience(trainer).open(Path(trainer.default_root_dir) / "episodes")
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Close the store and the environment, however the training has ended."""
+        _experience(trainer).close()
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Play what is missing."""
+        source, agent = _experience(trainer), cast(ActingModel, pl_module)
+        for record in source.collect(self.seed_episodes, random_policy, "random", self.seed):
+            _say(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
+        newest = None
+        with _acting(agent, exploring=True) as make_policy:
+            for record in source.collect(
+                self.seed_episodes + trainer.current_epoch, make_policy, type(agent).__name__, self.seed
+            ):
+                newest = record
+        steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
+        if newest is not None:
+            steps["return/exploring"] = newest.total_reward
+        agent.log_dict(steps, on_step=False, on_epoch=True, batch_size=1)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Measure the agent every few epochs, and at the end."""
+        number = trainer.current_epoch + 1
+        if number % self.evaluate_every and number != trainer.max_epochs:
+            return
+        agent, environment = cast(ActingModel, pl_module), _experience(trainer).environment
+        returns = []
+        with _acting(agent, exploring=False) as make_policy:
+            for place in range(self.evaluation_episodes):
+                chance = derive_seed(self.seed, "evaluation", place) % 2**32
+                returns.append(play(environment, make_policy(environment, chance), chance).reward.sum(dtype="float64"))
+        agent.log("return/acting", sum(returns) / len(returns), batch_size=1)
+
+
+@contextmanager
+def _acting(agent: ActingModel, exploring: bool) -> Iterator[MakePolicy]:
+    """Give what makes the agent's policy for an episode, in eval mode."""
+    training, choose = agent.training, agent.choose(exploring)
+    agent.eval()
+    yield lambda _, seed: Agent(agent.model, choose, seed)
+    agent.train(training)
+
+
+def _experience(trainer: Trainer) -> Experience:
+    source: Experience = trainer.datamodule.source  # type: ignore[attr-defined]
+    return source
+
+
+def _require_agent(trainer: Trainer, module: LightningModule) -> None:
+    source = trainer.datamodule.source  # type: ignore[attr-defined]
+    if not (isinstance(source, Experience) and isinstance(module, ActingModel)):
+        found = f"{type(module).__name__} on {type(source).__name__}"
+        raise ForbesError(f"Collect: found a {found}, expected an agent on Experience. Leave it out, or change them")
+
+
+def _say(trainer: Trainer, line: str) -> None:
+    if trainer.is_global_zero:
+        print(line, flush=True)

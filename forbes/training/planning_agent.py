@@ -1,0 +1,39 @@
+"""PlaNet as a LightningModule: a world model, whose agent searches for its next action anew at each step."""
+
+from typing import Any
+
+from forbes.control.agent import Choice, follow_plan, noisy
+from forbes.control.planning import CrossEntropy
+from forbes.training.acting import ActingModel
+from forbes.training.world_model import require_at_least
+
+__all__ = ["PlanningAgent"]
+
+
+class PlanningAgent(ActingModel):
+    """Learns the world model only, and plans in it (Hafner et al., 2019, arXiv 1811.04551), on beliefs of any family.
+
+    Args:
+        horizon: steps of a plan.
+        iterations: of the search.
+        candidates: J.
+        best: M, of which the next proposal is made.
+        **acting: arguments of `ActingModel` and `WorldModel`.
+
+    Raises:
+        ForbesError: when a number is below 1, or `best` above `candidates`.
+    """
+
+    def __init__(
+        self, horizon: int = 12, iterations: int = 10, candidates: int = 1000, best: int = 100, **acting: Any
+    ) -> None:
+        super().__init__(**acting)
+        name = type(self).__name__
+        require_at_least(1, name, horizon=horizon, iterations=iterations, best=best)
+        require_at_least(best, name, candidates=candidates)
+        self.search = CrossEntropy(horizon, iterations, candidates, best)
+
+    def choose(self, exploring: bool) -> Choice:
+        """See `ActingModel.choose`: the plan, with noise on it or not."""
+        plan = follow_plan(self.model, self.reward, self.search)
+        return noisy(plan, self.exploration) if exploring else plan
