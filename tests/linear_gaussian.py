@@ -43,10 +43,10 @@ def set_head(head, matrix, std):
         base.parameters_of.bias[2:] = (std - base.min_std).expm1().log()
 
 
-def linear_gaussian_model(belief):
+def linear_gaussian_model(belief, build=StateSpaceModel):
     """The process with q(s_t | s_{t-1}, o_t) = p(s_t | s_{t-1}, o_t), exact but for what later observations say."""
     torch.manual_seed(0)
-    model = StateSpaceModel(belief, Pixels(), Emission(), Normal(NOISE, scale=1.0), 0, 2, 4, 4, 1)
+    model = build(belief, Pixels(), Emission(), Normal(NOISE, scale=1.0), 0, 2, 4, 4, 1)
     eye = torch.eye(2)
     both = torch.cat((torch.cat((eye, -eye), 1), torch.cat((-eye, eye), 1)))  # (x⁺, x⁻) to (x, -x)
     precision = 1 / SPREAD**2 + EMISSION.square().sum(0) / NOISE**2  # of the posterior, diagonal
@@ -102,9 +102,9 @@ def drawn(steps, seed):
     return torch.stack(made)  # (T, 3)
 
 
-def gaussian():
+def gaussian(build=StateSpaceModel):
     """A model with its A, b and Q."""
-    model = linear_gaussian_model(partial(GaussianBelief, min_std=0.01))
+    model = linear_gaussian_model(partial(GaussianBelief, min_std=0.01), build)
     eye = torch.eye(2, dtype=torch.float64)
     return model, (TRANSITION.double(), 0 * eye[0], SPREAD**2 * eye)
 

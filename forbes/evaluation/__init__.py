@@ -1,9 +1,10 @@
 """Evaluation: bounds, proper scores and predictions of finished models, by one convention (DESIGN §8)."""
 
-from forbes.evaluation.bounds import score_trajectories
+from forbes.evaluation.bounds import score_predictions, score_trajectories
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.open_loop import score_open_loop
 from forbes.evaluation.predictions import Completions, complete
 from forbes.evaluation.smc import score_particles
 
-__all__ = ["Completions", "Estimate", "complete", "score_open_loop", "score_particles", "score_trajectories"]
+__all__ = ["Completions", "Estimate", "complete", "score_open_loop", "score_particles", "score_predictions"]
+__all__ += ["score_trajectories"]

@@ -14,6 +14,7 @@ does not count; logarithms and sums of probabilities in float64. With
 The product over time is inside the mean over particles (Burda et al., 2016, arXiv 1509.00519). The PLL scores the
 filtering belief: its particles are drawn from the belief after t - 1 observations (h_t follows from it) and see o_t
 only in their score, so it is a proper score of the belief, and its K-sample form a lower bound of itself (Jensen).
+A model that draws weighted sets of particles has their weights in the mean, one without randomness has K = 1.
 """
 
 import math
@@ -24,9 +25,10 @@ import torch
 from torch import Tensor
 
 from forbes.data import SequenceBatch
-from forbes.models import StateSpaceModel
+from forbes.models import BeliefModel, StateSpaceModel
 
-__all__ = ["Increments", "LogMeanExp", "Trajectory", "frame_log_prob", "score_trajectories", "trajectories"]
+__all__ = ["Increments", "LogMeanExp", "Trajectory", "frame_log_prob", "score_predictions", "score_trajectories"]
+__all__ += ["trajectories"]
 
 Increments = dict[str, Tensor]
 """Scores by name, `(B, T)` each in nats, float64: what each step adds; the sum over t is the sequence's score."""
@@ -63,7 +65,7 @@ class LogMeanExp:
         return self.total - math.log(self.number)
 
 
-def frame_log_prob(model: StateSpaceModel, features: Tensor, target: Tensor) -> Tensor:
+def frame_log_prob(model: BeliefModel, features: Tensor, target: Tensor) -> Tensor:
     """Give log p(o | features) in nats, float64, a few frames at a time.
 
     Args:
@@ -76,7 +78,7 @@ def frame_log_prob(model: StateSpaceModel, features: Tensor, target: Tensor) -> 
     """
     size = max(1, _FRAMES // math.prod(features.shape[:-2]))
     parts = [
-        model.likelihood.log_prob(model.decode(some).float(), true).double()
+        model.log_likelihood(some, true).double()
         for some, true in zip(features.split(size, -2), target.split(size), strict=True)
     ]
     return torch.cat(parts, -1)  # (*, N)
@@ -94,17 +96,14 @@ def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, pred
     embedding = model.embed(batch.observation)  # (B, T, E)
     target = model.likelihood.target(batch.observation).flatten(0, 1)  # (B T, *O)
 
-    def log_prob(hidden: Tensor, state: Tensor) -> Tensor:
-        features = torch.cat((hidden, state), -1).flatten(0, 1)  # (B T, H + D)
-        return frame_log_prob(model, features, target).view(batch.mask.shape)  # (B, T)
+    def log_prob(features: Tensor) -> Tensor:
+        return frame_log_prob(model, features.flatten(0, 1), target).view(batch.mask.shape)  # (B, T)
 
     for _ in range(number):
         filtered = model.filter(embedding, batch.action)
-        context = model.prior_context(filtered.hidden)  # (B, T, C)
-        kl = filtered.log_prob - model.prior.log_prob(filtered.state, context)
-        reconstruction = log_prob(filtered.hidden, filtered.state)
-        prediction = log_prob(filtered.hidden, model.prior.rsample(context)[0]) if predict else None
-        yield Trajectory(reconstruction, kl.double(), prediction)
+        kl = filtered.log_prob - model.prior_log_prob(filtered)
+        prediction = log_prob(model.predict(filtered)) if predict else None
+        yield Trajectory(log_prob(filtered.features), kl.double(), prediction)
 
 
 @torch.no_grad()
@@ -131,3 +130,19 @@ def score_trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int
     if predict:
         scores["pll"] = prediction.result()
     return {name: values * mask for name, values in scores.items()}
+
+
+@torch.no_grad()
+def score_predictions(model: BeliefModel, batch: SequenceBatch, number: int) -> Increments:
+    """Score a batch with K particles: `pll`, and `iwae` where the model has a posterior."""
+    if isinstance(model, StateSpaceModel) and model.particles == 1:
+        return score_trajectories(model, batch, number, predict=True)  # its trajectories serve both
+    seen, prediction = model.see(batch.observation, batch.action), LogMeanExp()
+    for _ in range(model.draws(number)):
+        features, log_weight = model.predictions(seen)
+        log_prob = frame_log_prob(model, features.flatten(1, 2), seen.target.flatten(0, 1))  # (K, B T)
+        prediction.add((log_prob.view(log_weight.shape) + log_weight).logsumexp(0))  # (B, T)
+    scores = {"pll": prediction.result() * batch.mask}
+    if isinstance(model, StateSpaceModel):
+        scores |= score_trajectories(model, batch, number, predict=False)
+    return scores

@@ -1,6 +1,7 @@
 """`forbes evaluate`: bounds and proper scores of trained models, and the paired difference of each two."""
 
 import argparse
+import itertools
 import shlex
 import sys
 import time
@@ -45,9 +46,12 @@ certain. So beside it:
   fivo       the sequential Monte-Carlo bound, by K particles, and their effective sample size
   open-loop  log p(rest | beginning), by K futures that start in the belief
 
-Data of a known process add log_p, the exact log p(o_1..T), which no bound exceeds. pll, fivo and open-loop take the
-first {_SUBSET} sequences, and their names say so. Writes evaluation.json, and evaluation.npz with each sequence's
-scores, into each run folder. Interrupted, the same command goes on where it stopped.
+Data of a known process add log_p, the exact log p(o_1..T), which no bound exceeds. A VectorModel has no bounds, since
+its likelihood is exact, and pll gives it; pll and open-loop of a ParticleModel are those of its own sets of particles.
+
+pll, fivo and open-loop take the first {_SUBSET} sequences, and their names say so. Writes evaluation.json, and
+evaluation.npz with each sequence's scores, into each run folder. Interrupted, the same command goes on where it
+stopped.
 
 On digit strokes and one core, elbo takes some 4 minutes a run, pll 5, fivo 3, and open-loop 20, in proportion to
 --futures and --digits."""
@@ -88,7 +92,7 @@ def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
     measured = []
     for number, run in enumerate(runs):
         one = Measured(run, {}, {})
-        for job in jobs:
+        for job in _of(run, jobs):
             finished.append(_measure(one, job, job.sha256[number], args))
         for entry in one.entries.values():
             date = datetime.now(UTC).isoformat(timespec="seconds")
@@ -103,10 +107,18 @@ def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
     return measured
 
 
-def wanted_metrics(path: str, args: Any) -> list[str]:
-    """Name the metrics that `evaluate` gives a run."""
-    (run,) = load_runs([path])
-    return [_metric_name(run, job, metric, args.split) for job in _jobs(args, [run]) for metric in job.score.metrics]
+def wanted_metrics(paths: Sequence[str], args: Any) -> list[dict[str, bool]]:
+    """Name the metrics that `evaluate` measures runs by, and tell for each run whether its model has them."""
+    runs = load_runs(paths)
+    jobs = _jobs(args, runs)
+    return [
+        {
+            _metric_name(run, job, metric, args.split): metric in job.score.of(run.model).metrics
+            for job in jobs
+            for metric in job.score.metrics
+        }
+        for run in runs
+    ]
 
 
 def _parser() -> ArgumentParser:
@@ -154,6 +166,13 @@ def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
     wanted = {
         name: make_pass(name, numbers[name], args.batch_size, args.context) for name in PASSES if name in args.scores
     }
+    if not any(score.of(run.model).metrics for run in runs for score in wanted.values()):
+        raise ForbesError(
+            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(wanted)} score, its likelihood is exact. "
+            "Ask for --scores pll or open-loop"
+        )
+    for run, name in itertools.product(runs, [name for name in ("pll", "open-loop") if name in wanted]):
+        run.model.draws(numbers[name])  # a number that cannot be is said before minutes are spent
     if isinstance(source := runs[0].data.source, Simulated):
         wanted = {"exact": exact_pass(source.process)} | wanted
     hashes: dict[int, list[str]] = {}
@@ -173,6 +192,12 @@ def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
             "that. Choose a smaller one, or name other --scores"
         )
     return jobs
+
+
+def _of(run: TrainedRun, jobs: Sequence[_Job]) -> list[_Job]:
+    """Leave out the scores that the run's model does not have."""
+    each = [job._replace(score=job.score.of(run.model)) for job in jobs]
+    return [job for job in each if job.score.metrics]
 
 
 def _count(run: TrainedRun, args: Any, default: int) -> int:

@@ -4,8 +4,9 @@ A family is a configuration, trained under several seeds. Its score is the mean 
 what another seed would change. A difference of two families is taken per seed, over the same sequences.
 """
 
+import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,17 +27,21 @@ class Family(NamedTuple):
     name: str
     runs: Mapping[int, str]
     """Run folders by seed."""
+    lacks: Collection[str] = ()
+    """Metrics that its models do not have."""
 
 
 class Comparison(NamedTuple):
     """What was measured, as tables; nats per sequence."""
 
     scores: pd.DataFrame
-    """A row for each family, metric and seed: mean, standard_error (over sequences), per_step, parameters, run."""
+    """A row for each family, metric and seed: mean, standard_error (over sequences), per_step, parameters, run; the
+    numbers are empty where the family does not have the metric."""
     differences: pd.DataFrame
-    """A row for each family but the first, score and seed: mean and standard_error of family - first, paired."""
+    """A row for each family but the first, score and seed: mean and standard_error of family - first, paired, where
+    both have it."""
     curves: dict[str, dict[str, list[float]]]
-    """By metric and family, the mean of each step over sequences and seeds."""
+    """By metric and family that has it, the mean of each step over sequences and seeds."""
 
 
 def compare(families: Sequence[Family], metrics: Sequence[str]) -> Comparison:
@@ -47,20 +52,18 @@ def compare(families: Sequence[Family], metrics: Sequence[str]) -> Comparison:
     """
     rows, curves = [], {}
     for metric in metrics:
-        entries = {family.name: _entries(family, metric) for family in families}
-        _require_same_data(metric, families, entries)
+        having = [family for family in families if metric not in family.lacks]
+        entries = {family.name: _entries(family, metric) for family in having}
+        _require_same_data(metric, having, entries)
         curves[metric] = {
             name: np.mean([entry["curve"] for entry in of_runs], axis=0).tolist() for name, of_runs in entries.items()
         }
-        rows += [
-            _row(family, metric, seed, entry)
-            for family in families
-            for seed, entry in zip(family.runs, entries[family.name], strict=True)
-        ]
-    scores = [metric for metric in metrics if score_of(metric) in SCORES]
-    differences = [
-        difference for metric in scores for other in families[1:] for difference in _paired(other, families[0], metric)
-    ]
+        for family in families:
+            own = entries.get(family.name) or [_blank(run, entries[having[0].name][0]) for run in family.runs.values()]
+            rows += [_row(family, metric, seed, entry) for seed, entry in zip(family.runs, own, strict=True)]
+    scores = [metric for metric in metrics if score_of(metric) in SCORES and metric not in families[0].lacks]
+    others = [(metric, other) for metric in scores for other in families[1:] if metric not in other.lacks]
+    differences = [difference for metric, other in others for difference in _paired(other, families[0], metric)]
     columns = ["family", "metric", "seed", "mean", "standard_error"]
     return Comparison(pd.DataFrame(rows), pd.DataFrame(differences, columns=columns), curves)
 
@@ -73,6 +76,13 @@ def _entries(family: Family, metric: str) -> list[dict[str, Any]]:
             raise ForbesError(f"{run}: evaluation.json has no {metric}. Measure it: forbes evaluate {run}")
         entries.append(record[metric])
     return entries
+
+
+def _blank(run: str, other: dict[str, Any]) -> dict[str, Any]:
+    """Give the entry of a metric that the run's model does not have, beside that of another."""
+    own = next(iter(read_record(run).values()))  # every entry has the parameters
+    nothing = {"mean": math.nan, "standard_error": math.nan, "per_step": {"mean": math.nan}}
+    return other | nothing | {"parameters": own["parameters"]}
 
 
 def _require_same_data(
@@ -111,21 +121,25 @@ def markdown(comparison: Comparison, families: Sequence[Family]) -> str:
     scores = comparison.scores.set_index(["metric", "family"]).sort_index()
     metrics = comparison.scores["metric"].unique()
     names = [family.name for family in families]
-    parameters = [f"{scores.loc[(metrics[0], name), 'parameters'].iloc[0]:,}" for name in names]
+    parameters = [f"{scores.loc[[(metrics[0], name)], 'parameters'].iloc[0]:,}" for name in names]
     lines = ["Nats per sequence, mean over seeds [lowest, highest]; ess as a share of K.", ""]
     lines += _table(["metric", *names], [["parameters", *parameters]])
     for metric in metrics:
         column = "per_step" if score_of(metric) == "ess" else "mean"
-        lines += _rows([[f"`{metric}`", *(_span(scores.loc[(metric, name), column].tolist()) for name in names)]])
+        lines += _rows([[f"`{metric}`", *(_span(scores.loc[[(metric, name)], column].tolist()) for name in names)]])
     if len(comparison.differences):
         lines += ["", f"Paired over sequences, minus {names[0]}: mean ± standard error.", ""]
         differences = comparison.differences.set_index(["metric", "family", "seed"])
         pairs = list(dict.fromkeys(zip(comparison.differences["family"], comparison.differences["seed"], strict=True)))
         lines += _table(["score", *(f"{name}, seed {seed}" for name, seed in pairs)], [])
         for metric in comparison.differences["metric"].unique():
-            each = [differences.loc[(metric, *pair)] for pair in pairs]
-            lines += _rows([[f"`{metric}`", *(str(Estimate(one["mean"], one["standard_error"])) for one in each)]])
+            each = [_difference(differences, (metric, *pair)) for pair in pairs]
+            lines += _rows([[f"`{metric}`", *each]])
     return "\n".join(lines) + "\n"
+
+
+def _difference(differences: pd.DataFrame, of: tuple[str, str, int]) -> str:
+    return str(Estimate(*differences.loc[of, ["mean", "standard_error"]])) if of in differences.index else "n/a"
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -138,4 +152,6 @@ def _rows(rows: Sequence[Sequence[str]]) -> list[str]:
 
 def _span(values: Sequence[float]) -> str:
     mean = statistics.fmean(values)
+    if math.isnan(mean):
+        return "n/a"
     return f"{mean:.2f}" if len(values) == 1 else f"{mean:.2f} [{min(values):.2f}, {max(values):.2f}]"

@@ -27,7 +27,7 @@ class Measured(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Two runs and the mean difference first - second of each score, over the same sequences."""
+    """Two runs and the mean difference first - second of each score that both have, over the same sequences."""
 
     first: Measured
     second: Measured
@@ -51,7 +51,7 @@ def pair(measured: Sequence[Measured]) -> list[Pair]:
             {
                 name: Estimate.of(total - second.totals[name])
                 for name, total in first.totals.items()
-                if score_of(name) in SCORES
+                if score_of(name) in SCORES and name in second.totals
             },
         )
         for first, second in pairs

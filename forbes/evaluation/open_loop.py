@@ -13,18 +13,19 @@ import torch
 
 from forbes.data import SequenceBatch
 from forbes.evaluation.bounds import Increments, LogMeanExp, frame_log_prob
-from forbes.models import StateSpaceModel
+from forbes.models import BeliefModel
 
 __all__ = ["score_open_loop"]
 
 
 @torch.no_grad()
-def score_open_loop(model: StateSpaceModel, batch: SequenceBatch, number: int, context: int) -> Increments:
+def score_open_loop(model: BeliefModel, batch: SequenceBatch, number: int, context: int) -> Increments:
     """Score a batch with K futures: `open_loop`, and `open_loop_marginal` for how it degrades with the horizon.
 
     The sum of `open_loop` over t is log p(o_{c+1:T} | o_{1:c}); `open_loop_marginal` is log p(o_t | o_{1:c}) of each
-    step on its own. Both are 0 up to c. Each future starts from a posterior trajectory of its own, since the belief
-    is over (h, s).
+    step on its own. Both are 0 up to c. Each draw of the belief gives as many futures as it has particles: an RSSM's
+    one, from a posterior trajectory of its own, since the belief is over (h, s); that of a model without randomness is
+    the only one.
 
     Args:
         model: in eval mode, on the batch's device.
@@ -33,16 +34,16 @@ def score_open_loop(model: StateSpaceModel, batch: SequenceBatch, number: int, c
         context: c, steps that the model sees, from 1 to T - 1.
     """
     mask = batch.mask[:, context:].double()  # (B, T - c)
-    embedding = model.embed(batch.observation[:, :context])  # (B, c, E)
+    seen = model.see(batch.observation[:, :context], batch.action[:, :context])
     target = model.likelihood.target(batch.observation[:, context:]).flatten(0, 1)  # (B (T - c), *O)
-    seen, future = batch.action[:, :context], batch.action[:, context:]
+    future = batch.action[:, context:].repeat(model.particles, 1, 1)  # (N B, T - c, A)
     joint, marginal = LogMeanExp(), LogMeanExp()
-    for _ in range(number):
-        start = model.filter(embedding, seen).at(-1)
-        features = model.imagine(start, future).features.flatten(0, 1)  # (B (T - c), H + D)
-        log_prob = frame_log_prob(model, features, target).view(mask.shape)  # (B, T - c)
-        joint.add((log_prob * mask).cumsum(1))
-        marginal.add(log_prob)
+    for _ in range(model.draws(number)):
+        features = model.imagine(model.beliefs(seen, model.particles), future).features  # (N B, T - c, F)
+        of_each = features.view(model.particles, len(target), -1)  # (N, B (T - c), F)
+        for log_prob in frame_log_prob(model, of_each, target).view(-1, *mask.shape):  # N times (B, T - c)
+            joint.add((log_prob * mask).cumsum(1))
+            marginal.add(log_prob)
     before = torch.zeros_like(batch.mask[:, :context], dtype=torch.float64)  # (B, c)
     scores = {
         "open_loop": joint.result().diff(dim=1, prepend=torch.zeros_like(mask[:, :1])),

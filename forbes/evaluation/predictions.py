@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
-from forbes.models import StateSpaceModel
+from forbes.models import BeliefModel
 
 __all__ = ["Completions", "complete", "first_of_each_class", "whole_sequences"]
 
@@ -25,10 +25,11 @@ class Completions(NamedTuple):
 
 
 @torch.no_grad()
-def complete(model: StateSpaceModel, batch: SequenceBatch, context: int, samples: int) -> Completions:
-    """Filter the first `context` steps, draw N states of the belief, roll each on to the batch's last step.
+def complete(model: BeliefModel, batch: SequenceBatch, context: int, samples: int) -> Completions:
+    """Filter the first `context` steps, draw N of the belief over (h, s), roll each on to the batch's last step.
 
-    Each sample keeps its own trajectory, so what it has decided stays decided.
+    Each sample keeps its own trajectory, so what it has decided stays decided. A model without randomness gives the
+    same N times.
 
     Args:
         model: on the batch's device.
@@ -37,8 +38,7 @@ def complete(model: StateSpaceModel, batch: SequenceBatch, context: int, samples
         samples: N.
     """
     sequences = len(batch.observation)
-    embedding = model.embed(batch.observation[:, :context])  # (B, context, E)
-    start = model.beliefs(model.filter(embedding, batch.action[:, :context]), context - 1, samples)  # (N B, ...)
+    start = model.beliefs(model.see(batch.observation[:, :context], batch.action[:, :context]), samples)  # (N B, ...)
     action = batch.action[:, context:].repeat(samples, 1, 1)  # (N B, T - context, A)
     output = model.decode(model.imagine(start, action).features)  # (N B, T - context, C, H, W)
     return Completions(model.likelihood.mean(output).unflatten(0, (samples, sequences)), context)

@@ -9,21 +9,24 @@ from typing import Any, NamedTuple
 
 import torch
 import yaml
+from torch import nn
 
-from forbes.beliefs import BeliefHead, CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
+from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
 from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
-from forbes.models import StateSpaceModel
+from forbes.models import BeliefModel, ParticleModel, StateSpaceModel, VectorModel
 from forbes.training.loading import load_run
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["TrainedRun", "data_name", "data_sha256", "load_runs", "require_comparable", "split_batches"]
 
-_FAMILIES: dict[type[BeliefHead], str] = {
+_FAMILIES: dict[type[nn.Module], str] = {
     GaussianBelief: "RSSM",
     FlowBelief: "FORBES",
     MixtureBelief: "Mixture",
     CategoricalBelief: "Categorical",
+    ParticleModel: "Particle",
+    VectorModel: "Vector",
 }
 
 
@@ -32,7 +35,7 @@ class TrainedRun(NamedTuple):
 
     path: str
     """As the user gave it."""
-    model: StateSpaceModel
+    model: BeliefModel
     data: SequenceDataModule
     config: dict[str, Any]
     """Sections `model` and `data` of config.yaml without the seeds: runs that differ in the seed only have the same."""
@@ -40,8 +43,7 @@ class TrainedRun(NamedTuple):
     @property
     def family(self) -> str:
         """The model's name, e.g. FORBES, with what its experiment's name adds, e.g. RSSM wide for `rssm_wide`."""
-        prior, posterior = self.model.prior, self.model.posterior
-        kind = type(prior if isinstance(posterior, GaussianBelief) else posterior)  # FORBES may have a flow in one only
+        kind = _kind(self.model)
         name = _FAMILIES.get(kind, kind.__name__)
         for part in reversed(Path(self.path).resolve().parts):
             if match := re.fullmatch(f"{name}((?:_[a-z]+)+)", part, re.IGNORECASE):
@@ -63,6 +65,14 @@ def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
         sections = {key: _without_seed(config[key]) for key in ("model", "data")}
         runs.append(TrainedRun(path, module.model.to(device), data, sections))
     return runs
+
+
+def _kind(model: BeliefModel) -> type[nn.Module]:
+    """Give what tells families apart: the belief's, or the model's where its filter is another."""
+    if type(model) is not StateSpaceModel:
+        return type(model)
+    prior, posterior = model.prior, model.posterior
+    return type(prior if isinstance(posterior, GaussianBelief) else posterior)  # FORBES may have a flow in one only
 
 
 def _without_seed(section: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,11 +16,11 @@ from torch import Tensor
 
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.evaluation.bounds import Increments, score_trajectories
+from forbes.evaluation.bounds import Increments, score_predictions, score_trajectories
 from forbes.evaluation.open_loop import score_open_loop
 from forbes.evaluation.smc import score_particles
 from forbes.files import replace_file
-from forbes.models import StateSpaceModel
+from forbes.models import BeliefModel, StateSpaceModel
 from forbes.pomdps import Process
 from forbes.seeding import derive_seed
 
@@ -34,9 +34,15 @@ class Pass(NamedTuple):
     """The scores it is asked for, of those the function gives."""
     tag: str
     """Numbers of samples and the like, part of each metric's name."""
-    function: Callable[[StateSpaceModel, SequenceBatch], Increments]
+    function: Callable[[Any, SequenceBatch], Increments]
+    """Of a model that has at least one of the metrics, and a batch."""
     batch_size: int
     """Sequences at a time."""
+
+    def of(self, model: BeliefModel) -> "Pass":
+        """Leave the bounds out for a model without a posterior: its likelihood is exact, and `pll` gives it."""
+        bounds = () if isinstance(model, StateSpaceModel) else _BOUNDS
+        return self._replace(metrics=tuple(metric for metric in self.metrics if metric not in bounds))
 
 
 class Scores(NamedTuple):
@@ -54,6 +60,7 @@ class Scores(NamedTuple):
 
 
 PASSES = ("elbo", "pll", "fivo", "open-loop")
+_BOUNDS = ("elbo", "reconstruction", "kl", "iwae", "fivo", "ess")
 _FIVO_ROWS = 16
 """FIVO holds all particles of a sequence at once: so many rows for each sequence of another pass's batch."""
 
@@ -72,8 +79,7 @@ def make_pass(name: str, number: int, batch_size: int, context: int) -> Pass:
         function = partial(score_trajectories, number=number, predict=False)
         return Pass(("elbo", "reconstruction", "kl"), f"S={number}", function, batch_size)
     if name == "pll":
-        function = partial(score_trajectories, number=number, predict=True)
-        return Pass(("iwae", "pll"), f"K={number}", function, batch_size)
+        return Pass(("iwae", "pll"), f"K={number}", partial(score_predictions, number=number), batch_size)
     if name == "fivo":
         rows = max(1, _FIVO_ROWS * batch_size // number)
         return Pass(("fivo", "ess"), f"K={number}", partial(score_particles, number=number), rows)
@@ -90,7 +96,7 @@ def exact_pass(process: Process) -> Pass:
     No bound is above it, and no belief has a higher prequential score in expectation.
     """
 
-    def function(model: StateSpaceModel, batch: SequenceBatch) -> Increments:
+    def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         return {"log_p": process.exact_filter(batch.observation, batch.action).step_log_likelihood}
 
     return Pass(("log_p",), "exact", function, _EXACT_ROWS)
@@ -132,7 +138,7 @@ class Parts:
 
 
 def score_split(
-    model: StateSpaceModel,
+    model: BeliefModel,
     batches: Iterable[tuple[int, SequenceBatch]],
     score: Pass,
     seed: int = 0,
@@ -167,7 +173,7 @@ def score_split(
     return Scores(merged, torch.cat([scores.mask for scores in found]))
 
 
-def _score(model: StateSpaceModel, first: int, batch: SequenceBatch, score: Pass, seed: int, where: str) -> Increments:
+def _score(model: BeliefModel, first: int, batch: SequenceBatch, score: Pass, seed: int, where: str) -> Increments:
     """Score a batch; where the memory does not suffice, each half of it."""
     torch.manual_seed(derive_seed(seed, "evaluation", first))
     try:

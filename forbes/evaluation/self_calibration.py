@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forbes.evaluation.bounds import LogMeanExp
 from forbes.evaluation.calibration import ranks, tarp_ranks
-from forbes.models import StateSpaceModel
+from forbes.models import Seen, StateSpaceModel
 from forbes.seeding import derive_seed, generator
 
 __all__ = ["SelfCalibration", "self_calibration"]
@@ -40,19 +40,20 @@ def self_calibration(model: StateSpaceModel, action: Tensor, samples: int, seed:
     Args:
         model: in eval mode, on the action's device.
         action: a_{t-1} of N sequences up to the step that is checked, `(N, t, A)`.
-        samples: L, of each belief; each has a posterior trajectory of its own, since the belief is over (h, s).
+        samples: L, of each belief; each from a draw of the belief of its own, since the belief is over (h, s).
         seed: of everything that is drawn.
     """
     devices = [action.device] if action.device.type == "cuda" else []
     with torch.random.fork_rng(devices):
         torch.manual_seed(derive_seed(seed, "self-calibration", 0))
         rollout = model.imagine(model.initial(len(action)), action)
-        embedding = model.encode(model.likelihood.sample(model.decode(rollout.features)))  # (N, t, E)
+        observation = model.likelihood.sample(model.decode(rollout.features))  # (N, t, *O)
+        seen = Seen(observation, model.encode(observation), action)
         truth = rollout.state[:, -1]  # (N, D)
-        draws = torch.stack([model.filter(embedding, action).state[:, -1] for _ in range(samples + 1)])  # (L + 1, N, D)
+        draws = torch.stack([model.beliefs(seen, 1).state for _ in range(samples + 1)])  # (L + 1, N, D)
         of_truth, of_draws = LogMeanExp(), LogMeanExp()
         for _ in range(_COMPONENTS):
-            context = model.filter(embedding, action).context[:, -1]  # (N, C)
+            context = model.filter(seen.embedding, action).context[:, -1]  # (N, C)
             of_truth.add(model.posterior.log_prob(truth, context).double())
             of_draws.add(model.posterior.log_prob(draws[1:], context).double())
     draw = generator(seed, "ties", 0)

@@ -1,7 +1,9 @@
 """The tables that `forbes evaluate` prints."""
 
+import itertools
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -14,34 +16,30 @@ __all__ = ["print_pairs", "print_runs"]
 
 
 def print_runs(measured: Sequence[Measured]) -> None:
-    """Print every metric of every run."""
+    """Print every metric of every run; n/a where its model does not have it."""
     table = Table(title="scores in nats per sequence, mean ± standard error over sequences; ess as a share of K")
     for header in ("run", "family"):
         table.add_column(header, overflow="fold")
     table.add_column("parameters", justify="right")
-    for name in measured[0].entries:
+    names = _union(one.entries for one in measured)
+    for name in names:
         table.add_column(_header(name), justify="right")
     for one in measured:
-        cells = [
-            f"{entry['per_step']['mean']:.3f}" if "/ess[" in name else str(_estimate(entry))
-            for name, entry in one.entries.items()
-        ]
+        cells = [_cell(name, one.entries[name]) if name in one.entries else "n/a" for name in names]
         table.add_row(escape(one.run.path), one.run.family, f"{one.run.parameters:,}", *cells)
     _console().print(table)
 
 
 def print_pairs(pairs: Sequence[Pair]) -> None:
-    """Print the paired difference of every metric of which more is better."""
+    """Print the paired difference of every metric of which more is better; n/a where a model does not have it."""
     table = Table(title="paired difference over the same sequences, in nats per sequence; (in standard errors)")
     for header in ("run", "minus"):
         table.add_column(header, overflow="fold")
-    for name in pairs[0].differences:
+    names = _union(one.differences for one in pairs)
+    for name in names:
         table.add_column(_header(name), justify="right")
     for first, second, differences in pairs:
-        cells = [
-            f"{difference.mean:+.2f} ± {difference.standard_error:.2f} ({_ratio(difference)})"
-            for difference in differences.values()
-        ]
+        cells = [_difference(differences[name]) if name in differences else "n/a" for name in names]
         table.add_row(escape(first.run.path), escape(second.run.path), *cells)
     _console().print(table)
 
@@ -57,8 +55,22 @@ def _header(name: str) -> str:
     return escape(f"{split}\n{score}\n[{tag}")
 
 
+def _union(tables: Iterable[Iterable[str]]) -> list[str]:
+    """Give every name once; those that some lack come where the longest table has them."""
+    longest_first = sorted([list(names) for names in tables], key=len, reverse=True)
+    return list(dict.fromkeys(itertools.chain.from_iterable(longest_first)))
+
+
+def _cell(name: str, entry: dict[str, Any]) -> str:
+    return f"{entry['per_step']['mean']:.3f}" if "/ess[" in name else str(_estimate(entry))
+
+
 def _estimate(entry: dict[str, float]) -> Estimate:
     return Estimate(entry["mean"], entry["standard_error"])
+
+
+def _difference(difference: Estimate) -> str:
+    return f"{difference.mean:+.2f} ± {difference.standard_error:.2f} ({_ratio(difference)})"
 
 
 def _ratio(difference: Estimate) -> str:

@@ -18,6 +18,7 @@ from forbes.evaluation.self_calibration import SelfCalibration, self_calibration
 from forbes.evaluation.uniformity import pearson
 from forbes.figures.calibration import RankedBelief, calibration
 from forbes.figures.style import PALETTE, save_figure
+from forbes.models import StateSpaceModel
 
 __all__ = ["main"]
 
@@ -62,6 +63,8 @@ def _parser() -> ArgumentParser:
 
 def _check(run: TrainedRun, sequences: int, time: int, samples: int, seed: int) -> SelfCalibration:
     """Check one run; actions are those of its training split, from the first sequence on."""
+    if not isinstance(run.model, StateSpaceModel):
+        raise ForbesError(f"{run.path}: a {run.family} model has no state that could be ranked. Name other runs")
     size = run.data.source.size("train")
     if time > run.data.length:
         raise ForbesError(f"--time {time}: the sequences of {run.path} have {run.data.length} steps. Choose fewer")

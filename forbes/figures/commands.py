@@ -26,7 +26,8 @@ Draw the paper's figures from run folders, each as PNG and PDF.
   forbes figures strokes --runs runs/compare/forbes-0 runs/compare/rssm-0 -o figures
 
 strokes: predictions-t30 (Figure 4), the same rolled on to the end of the longest digit, and elbo (Figure 5). Runs that
-differ in their seed only are one family: Figure 4 shows the first of them, Figure 5 their mean and range.
+differ in their seed only are one family: Figure 4 shows the first of them, Figure 5 their mean and range. A family that
+is trained by another bound than the ELBO is drawn by that one, and the legend says so.
 Digits of Figure 4, unless --index names others: of the first 500 test digits, for each class the one whose beginning
 leaves its class most open, judged by the labels of its 50 nearest training digits. No model has a say in the choice."""
 
@@ -51,8 +52,7 @@ def main(argv: Sequence[str]) -> None:
     for time in sorted({data.length, batch.observation.shape[1]}):
         figure = predictions(families, batch, time, args.context, args.samples)
         _save(figure, args.output, f"predictions-t{time}")
-    metric = f"elbo[{runs[0].model.likelihood.name},S=1]"
-    _save(elbo_against_updates(families, metric.replace("elbo", "ELBO")), args.output, "elbo")
+    _save(elbo_against_updates(families), args.output, "elbo")
 
 
 def _parser() -> ArgumentParser:
@@ -88,16 +88,18 @@ def group(runs: Sequence[TrainedRun]) -> list[Family]:
 
 
 def _curve(run: TrainedRun) -> pd.Series:
-    """Give the validation ELBO against updates."""
+    """Give the bound of the validation split against updates."""
     metrics = read_metrics(run.path)
-    name = f"val/elbo[{run.model.likelihood.name},S=1]"
+    name = f"val/{run.model.bound_name}"
     if name not in metrics:
         raise ForbesError(f"{run.path}: metrics.jsonl has no {name}. Train the run to its first validation")
     return metrics[name].dropna()
 
 
 def _test_elbo(run: TrainedRun) -> float | None:
-    """Give what `forbes evaluate` found on the whole test split, if it was asked."""
+    """Give the ELBO that `forbes evaluate` found on the whole test split, if it was asked and is what is drawn."""
+    if not run.model.bound_name.startswith("elbo["):
+        return None
     return next((entry["mean"] for name, entry in read_record(run.path).items() if name.startswith("test/elbo[")), None)
 
 

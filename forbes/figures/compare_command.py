@@ -4,9 +4,11 @@ import json
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 from rich.console import Console
 from rich.markdown import Markdown
 
@@ -43,12 +45,15 @@ def main(argv: Sequence[str]) -> None:
     for config, family in zip(args.configs, families, strict=True):
         for seed, run in family.runs.items():
             _fit(config, seed, run, flags)
-    metrics = wanted_metrics(families[0].runs[0], args)
-    runs = [run for family in families for run in family.runs.values()]
-    missing = [run for run in runs if not _is_measured(run, metrics)]
+    wanted = wanted_metrics([family.runs[0] for family in families], args)
+    families = [
+        family._replace(lacks=[metric for metric, has in of_family.items() if not has])
+        for family, of_family in zip(families, wanted, strict=True)
+    ]
+    missing = [run for family in families for run in family.runs.values() if not _is_measured(run, family, wanted[0])]
     if missing:
         evaluate(missing, args, command)
-    comparison = compare(families, metrics)
+    comparison = compare(families, [metric for metric in wanted[0] if any(has[metric] for has in wanted)])
     _write(comparison, families, args.output, command)
 
 
@@ -94,25 +99,32 @@ def _forbes_fit(arguments: Sequence[str]) -> int:
     return subprocess.run([sys.executable, "-m", "forbes", "fit", *arguments], check=False).returncode
 
 
-def _is_measured(run: str, metrics: Sequence[str]) -> bool:
-    """Tell whether every metric is recorded of the run's present checkpoint."""
+def _is_measured(run: str, family: Family, metrics: Iterable[str]) -> bool:
+    """Tell whether every metric that the family has is recorded of the run's present checkpoint."""
     record, checkpoint = read_record(run), RunFolder(run).checkpoint_sha256()
-    return all(metric in record and record[metric]["checkpoint"] == checkpoint for metric in metrics)
+    wanted = [metric for metric in metrics if metric not in family.lacks]
+    return all(metric in record and record[metric]["checkpoint"] == checkpoint for metric in wanted)
 
 
 def _write(comparison: Comparison, families: Sequence[Family], folder: Path, command: str) -> None:
     """Write tables and pictures, and print the table."""
     text = markdown(comparison, families)
-    tables = {name: getattr(comparison, name).to_dict("records") for name in ("scores", "differences")}
+    tables = {name: _records(getattr(comparison, name)) for name in ("scores", "differences")}
     record = {"command": command, "commit": commit(), **tables, "curves": comparison.curves}
     replace_file(folder / "comparison.csv", comparison.scores.to_csv(index=False).encode())
     replace_file(folder / "comparison.json", (json.dumps(record, indent=2) + "\n").encode())
     replace_file(folder / "comparison.md", text.encode())
     figures = {"scores": scores(comparison), "per-step": per_step(comparison)}
-    if len(families) > 1:
+    if len(comparison.differences):
         figures["differences"] = differences(comparison, families[0].name)
     for name, figure in figures.items():
         for suffix in (".png", ".pdf"):
             save_figure(figure, folder / f"{name}{suffix}")
     Console(width=None if sys.stdout.isatty() else 200).print(Markdown(text))
     print(f"comparison.csv, .json, .md and {', '.join(figures)} are in {folder}")
+
+
+def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Give the rows, empty numbers as null: JSON has no NaN."""
+    rows: list[dict[str, Any]] = table.astype(object).where(table.notna(), None).to_dict("records")
+    return rows

@@ -18,7 +18,10 @@ _PER_STEP = ("elbo", "pll", "open_loop_marginal")
 
 
 def scores(comparison: Comparison) -> Figure:
-    """Draw each score in a panel: a dot for each seed with its standard error, a bar at the mean over seeds."""
+    """Draw each score in a panel: a dot for each seed with its standard error, a bar at the mean over seeds.
+
+    The line of a family that does not have the score stays empty.
+    """
     table = comparison.scores
     metrics = [metric for metric in table["metric"].unique() if score_of(metric) in SCORES]
     families = list(table["family"].unique())
@@ -47,36 +50,42 @@ def scores(comparison: Comparison) -> Figure:
 def per_step(comparison: Comparison) -> Figure:
     """Draw the mean of each step over sequences and seeds, a panel for each score that has one."""
     metrics = [metric for metric in comparison.curves if score_of(metric) in _PER_STEP]
+    colours = dict(zip(comparison.scores["family"].unique(), cycle(PALETTE), strict=False))
     with paper_style():
         figure = Figure((PAGE, 2.6), layout="constrained")
         panels = figure.subplots(1, len(metrics), squeeze=False)[0]
         for axes, metric in zip(panels, metrics, strict=True):
-            _draw_steps(axes, comparison.curves[metric], metric)
+            _draw_steps(axes, comparison.curves[metric], metric, colours)
         panels[0].set_ylabel("nats per step")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+        lines = {line.get_label(): line for axes in panels for line in axes.lines}  # not every family is in each panel
+        named = {name: lines[name] for name in colours if name in lines}
+        figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=4)
     return figure
 
 
-def _draw_steps(axes: Axes, curves: dict[str, list[float]], metric: str) -> None:
-    for (name, curve), colour in zip(curves.items(), cycle(PALETTE), strict=False):
+def _draw_steps(axes: Axes, curves: dict[str, list[float]], metric: str, colours: dict[str, str]) -> None:
+    for name, curve in curves.items():
         steps = np.arange(1, len(curve) + 1)
         shown = np.cumsum(np.abs(curve)) > 0  # the open-loop score begins after its context
-        axes.plot(steps[shown], np.asarray(curve)[shown], color=colour, label=name)
+        axes.plot(steps[shown], np.asarray(curve)[shown], color=colours[name], label=name)
     axes.set_title(_in_lines(metric))
     axes.set_xlabel("step")
 
 
 def differences(comparison: Comparison, first: str) -> Figure:
-    """Draw the mean difference to the first family, families × scores; colours compare within a column."""
+    """Draw the mean difference to the first family, families × scores; colours compare within a column.
+
+    A cell says n/a where one of the two does not have the score.
+    """
     table = comparison.differences.groupby(["family", "metric"], sort=False)["mean"].mean().unstack(sort=False)
     values = table.to_numpy()  # (families, scores)
     with paper_style():
         figure = Figure((PAGE, 0.9 + 0.3 * len(table)), layout="constrained")
         axes = figure.subplots()
-        largest = np.abs(values).max(0)
+        largest = np.nanmax(np.abs(values), 0)
         axes.imshow(values / np.where(largest > 0, largest, 1), cmap="PuOr", vmin=-3, vmax=3, aspect="auto")
         for (row, column), value in np.ndenumerate(values):
-            axes.text(column, row, f"{value:+.2f}", ha="center", va="center")
+            axes.text(column, row, "n/a" if np.isnan(value) else f"{value:+.2f}", ha="center", va="center")
         axes.set_xticks(range(len(table.columns)), [_in_lines(metric) for metric in table.columns])
         axes.set_yticks(range(len(table)), table.index)
         axes.set_title(f"nats per sequence more than {first}, paired, mean over seeds")

@@ -13,7 +13,7 @@ from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
 from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import COLUMN, paper_style, show_settled
-from forbes.models import StateSpaceModel
+from forbes.models import BeliefModel
 
 __all__ = ["Family", "ambiguous_digits", "elbo_against_updates", "predictions"]
 
@@ -23,12 +23,12 @@ class Family(NamedTuple):
 
     name: str
     colour: str
-    model: StateSpaceModel
+    model: BeliefModel
     """Of the first run."""
     curves: Sequence[pd.Series]
-    """Validation ELBO against updates, one for each run."""
+    """The bound that it is trained by, of the validation split against updates, one for each run."""
     tests: Sequence[float]
-    """Test ELBO of each run that was evaluated."""
+    """Test ELBO of each run that was evaluated, where that is the bound."""
 
 
 def predictions(
@@ -54,15 +54,20 @@ def predictions(
     return draw_panels(panels)
 
 
-def elbo_against_updates(families: Sequence[Family], metric: str) -> Figure:
-    """Draw Figure 5: validation ELBO against updates, mean and range over runs; a diamond is the final test ELBO."""
+def elbo_against_updates(families: Sequence[Family]) -> Figure:
+    """Draw Figure 5: validation ELBO against updates, mean and range over runs; a diamond is the final test ELBO.
+
+    A family that is trained by another bound is drawn by that one, and then the legend names each.
+    """
+    bounds = [family.model.bound_name for family in families]
     with paper_style():
         figure = Figure((COLUMN, 2.3), layout="constrained")
         axes = figure.subplots()
-        for family in families:
+        for family, bound in zip(families, bounds, strict=True):
             table = pd.concat(family.curves, axis=1).dropna()  # updates that all runs have
             mean, runs = table.mean(axis=1), len(family.curves)
             label = family.name if runs == 1 else f"{family.name}, {runs} runs"
+            label += f", {bound}" if len(set(bounds)) > 1 else ""
             axes.fill_between(table.index, table.min(axis=1), table.max(axis=1), color=family.colour, alpha=0.2, lw=0)
             axes.plot(table.index, mean, color=family.colour, label=label)
             if family.tests:
@@ -72,7 +77,8 @@ def elbo_against_updates(families: Sequence[Family], metric: str) -> Figure:
         if any(family.tests for family in families):
             axes.plot([], [], "D", color="none", markeredgecolor="black", markersize=4, label="test, at the end")
         show_settled(axes, [curve for family in families for curve in family.curves])
-        axes.set(xlabel="updates", ylabel=f"validation {metric}\nnats per sequence")
+        title = bounds[0].replace("elbo", "ELBO") if len(set(bounds)) == 1 else "bound"
+        axes.set(xlabel="updates", ylabel=f"validation {title}\nnats per sequence")
         axes.legend(loc="lower right")
     return figure
 

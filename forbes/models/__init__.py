@@ -1,11 +1,15 @@
 """State-space models as pure modules: they compute and return records, and never log."""
 
+from forbes.models.base import BeliefModel, ModelFamily, Prediction, Rollout, Seen, State
 from forbes.models.elbo import ElboTerms, elbo_loss
 from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
-from forbes.models.state_space import Filtered, Rollout, State, StateSpaceModel
+from forbes.models.particles import ParticleModel
+from forbes.models.state_space import Filtered, StateSpaceModel
+from forbes.models.vector import VectorModel
 
 __all__ = [
+    "BeliefModel",
     "Bernoulli",
     "ConvDecoder",
     "ConvEncoder",
@@ -14,11 +18,16 @@ __all__ = [
     "Likelihood",
     "MLPDecoder",
     "MLPEncoder",
+    "ModelFamily",
     "Normal",
     "OneHot",
+    "ParticleModel",
+    "Prediction",
     "Rollout",
+    "Seen",
     "State",
     "StateSpaceModel",
+    "VectorModel",
     "VectorNormal",
     "elbo_loss",
 ]

@@ -1,5 +1,6 @@
 """The evidence lower bound of a recurrent belief model and the loss that trains it (paper, equation of §3.1)."""
 
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 from torch import Tensor
@@ -23,6 +24,8 @@ class ElboTerms(NamedTuple):
     """The closed form of its expectation given (h_t, e_t), `(B, T)`, where the family has one."""
     mask: Tensor
     """True where the step counts, `(B, T)`."""
+    auxiliary: Mapping[str, Tensor] = {}
+    """Further losses by name, nats per step, scalars: for the loss only, a reported bound never has them."""
 
     @property
     def elbo(self) -> Tensor:
@@ -43,7 +46,7 @@ def elbo_loss(
               L = \beta\,\overline{\max(KL_t, n)} - \overline{\log p(o_t)}
 
     The bar is the mean over batch and time, padding left out. The KL is the closed form where the terms have one.
-    Free nats and the weight are for the loss only; a reported bound never has them.
+    Free nats and the weight are for the loss only; a reported bound never has them. Auxiliary losses are added.
 
     Args:
         terms: the parts of the bound.
@@ -59,4 +62,5 @@ def elbo_loss(
         divergence = terms.mean_over_steps(kl.clamp(min=free_nats))
     else:
         divergence = terms.mean_over_steps(kl).clamp(min=free_nats) if free_nats > 0 else terms.mean_over_steps(kl)
-    return kl_weight * divergence - terms.mean_over_steps(terms.reconstruction)
+    loss = kl_weight * divergence - terms.mean_over_steps(terms.reconstruction)
+    return sum(terms.auxiliary.values(), loss)

@@ -18,40 +18,17 @@ from torch.nn.functional import linear
 
 from forbes.beliefs import BeliefFamily, BeliefHead
 from forbes.deferred import Affine, Loop
+from forbes.errors import ForbesError
+from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
 from forbes.models.elbo import ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, bind_gru, perceptron
 
-__all__ = ["Filtered", "Rollout", "State", "StateSpaceModel"]
-
-
-class State(NamedTuple):
-    """What the recurrence carries."""
-
-    hidden: Tensor
-    """h, `(*, H)`."""
-    state: Tensor
-    """s, `(*, D)`."""
-
-
-class Rollout(NamedTuple):
-    """A trajectory of the prior."""
-
-    hidden: Tensor
-    """h_t, `(B, T, H)`."""
-    state: Tensor
-    """s_t, drawn from the prior, `(B, T, D)`."""
-    log_prob: Tensor
-    """log p(s_t | h_t) in nats, `(B, T)`."""
-
-    @property
-    def features(self) -> Tensor:
-        """[h_t, s_t], the input of every decoder, `(B, T, H + D)`."""
-        return torch.cat((self.hidden, self.state), -1)  # (B, T, H + D)
+__all__ = ["Filtered", "StateSpaceModel"]
 
 
 class Filtered(NamedTuple):
-    """A trajectory of the posterior, with what the bound and further samples need."""
+    """A trajectory of the posterior, with what the bound and further samples need; one step of it has no T."""
 
     hidden: Tensor
     """h_t, `(B, T, H)`."""
@@ -72,7 +49,7 @@ class Filtered(NamedTuple):
         return State(self.hidden[:, time], self.state[:, time])  # (B, H), (B, D)
 
 
-class StateSpaceModel(nn.Module):
+class StateSpaceModel(BeliefModel):
     """RSSM with any belief family: Gaussian gives PlaNet's and Dreamer's, flow gives FORBES.
 
     Args:
@@ -101,29 +78,50 @@ class StateSpaceModel(nn.Module):
         mlp_layers: int,
         prior: BeliefFamily | None = None,
     ) -> None:
-        super().__init__()
-        self.action_dim, self.state_dim, self.hidden_dim = action_dim, state_dim, hidden_dim
-        self.encoder, self.decoder, self.likelihood = encoder, decoder, likelihood
-        self.transition = perceptron(state_dim + action_dim, mlp_dim, mlp_layers)
-        self.gru = nn.GRUCell(mlp_dim, hidden_dim)
+        if state_dim < 1:
+            raise ForbesError(f"{type(self).__name__}: state_dim is {state_dim}, expected at least 1")
+        super().__init__(encoder, decoder, likelihood, state_dim + action_dim, hidden_dim, mlp_dim, mlp_layers)
+        self.action_dim, self.state_dim = action_dim, state_dim
         self.prior_context = perceptron(hidden_dim, mlp_dim, mlp_layers)
         self.posterior_context = perceptron(hidden_dim + encoder.embedding_dim, mlp_dim, mlp_layers)
         self.prior: BeliefHead = (prior or belief)(state_dim, mlp_dim)
         self.posterior: BeliefHead = belief(state_dim, mlp_dim)
+
+    @property
+    def bound_name(self) -> str:
+        """See `BeliefModel.bound_name`."""
+        return f"elbo[{self.likelihood.name},S=1]"
 
     def initial(self, batch: int) -> State:
         """Give (h_0, s_0) = 0."""
         weight = self.gru.weight_hh
         return State(weight.new_zeros(batch, self.hidden_dim), weight.new_zeros(batch, self.state_dim))
 
-    def embed(self, observation: Tensor) -> Tensor:
-        """Encode every frame: stored observations `(B, T, *O)` to e `(B, T, E)`."""
-        return self.encode(self.likelihood.target(observation))
+    def bind(self, embedding: Tensor, action: Tensor, copies: int = 1) -> Callable[[State], Filtered]:
+        """Prepare the filter for a loop over a sequence: what does not depend on the recurrence is computed here.
 
-    def encode(self, target: Tensor) -> Tensor:
-        """Encode every frame as `Likelihood.target` or `Likelihood.sample` gives it: `(B, T, *O)` to e `(B, T, E)`."""
-        embedding: Tensor = self.encoder(target.flatten(0, 1))  # (B T, E)
-        return embedding.view(*target.shape[:2], -1)  # (B, T, E)
+        Args:
+            embedding: e_t, `(B, T, E)`.
+            action: a_{t-1}, the action that led to o_t, `(B, T, A)`.
+            copies: of each sequence that are filtered side by side, N.
+
+        Returns:
+            One step, to be called T times: (h, s) before it to those after it, `(N B, ...)`, copy-major.
+        """
+        batch, time = embedding.shape[:2]
+        loop = Loop(time, copies * batch)
+        transition = self._bind(self.transition, action, loop)
+        posterior_context = self._bind(self.posterior_context, embedding, loop)
+        gru = bind_gru(self.gru, loop)
+        sample = self.posterior.sampler(loop)
+
+        def step(before: State) -> Filtered:
+            hidden = gru(transition(before.state), before.hidden)
+            context = posterior_context(hidden)
+            state, log_prob = sample(context)
+            return Filtered(hidden, state, context, log_prob)
+
+        return step
 
     def filter(self, embedding: Tensor, action: Tensor, start: State | None = None) -> Filtered:
         """Run the posterior along a sequence.
@@ -137,20 +135,12 @@ class StateSpaceModel(nn.Module):
             One trajectory of (h_t, s_t) per sequence. A prefix of the input gives the prefix of the output (for
             the same noise): nothing looks ahead.
         """
-        batch, time = embedding.shape[:2]
-        hidden, state = start or self.initial(batch)
-        loop = Loop(time, batch)
-        transition = self._bind(self.transition, action, loop)
-        posterior_context = self._bind(self.posterior_context, embedding, loop)
-        gru = bind_gru(self.gru, loop)
-        sample = self.posterior.sampler(loop)
-
-        steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-        for _ in range(time):
-            hidden = gru(transition(state), hidden)
-            context = posterior_context(hidden)
-            state, log_prob = sample(context)
-            steps.append((hidden, state, context, log_prob))
+        step = self.bind(embedding, action)
+        state = start or self.initial(len(embedding))
+        steps: list[Filtered] = []
+        for _ in range(embedding.shape[1]):
+            steps.append(step(state))
+            state = State(steps[-1].hidden, steps[-1].state)
         return Filtered(*(torch.stack(values, 1) for values in zip(*steps, strict=True)))  # (B, T, ...)
 
     def prior_log_prob(self, filtered: Filtered) -> Tensor:
@@ -158,15 +148,7 @@ class StateSpaceModel(nn.Module):
         return self.prior.log_prob(filtered.state, self.prior_context(filtered.hidden))
 
     def imagine(self, start: State, action: Tensor) -> Rollout:
-        """Roll the prior on from `start`, each row on its own trajectory.
-
-        Args:
-            start: (h, s), `(B, ...)`; `beliefs` gives several per history.
-            action: a of each step, the one that leads to it, `(B, T, A)`.
-
-        Returns:
-            T steps after `start`, which itself is not among them.
-        """
+        """See `BeliefModel.imagine`: rolls the prior on."""
         given = iter(action.unbind(1))
         return self.roll(start, lambda _: next(given), action.shape[1])
 
@@ -191,29 +173,30 @@ class StateSpaceModel(nn.Module):
             made.append((hidden, state, log_prob))
         return Rollout(*(torch.stack(values, 1) for values in zip(*made, strict=True)))  # (B, T, ...)
 
-    def beliefs(self, filtered: Filtered, time: int, samples: int) -> State:
-        """Draw N samples of each belief q(s_t | h_t, e_t) at one step: `(N B, ...)`, sample-major."""
-        state, _ = self.posterior.rsample(filtered.context[:, time], (samples,))  # (N, B, D)
-        hidden = filtered.hidden[:, time].expand(samples, -1, -1)  # (N, B, H)
-        return State(hidden.flatten(0, 1), state.flatten(0, 1))  # (N B, H), (N B, D)
+    def beliefs(self, seen: Seen, samples: int) -> State:
+        """See `BeliefModel.beliefs`: each from a posterior trajectory of its own, since the belief is over (h, s)."""
+        return self.filter(seen.embedding.repeat(samples, 1, 1), seen.action.repeat(samples, 1, 1)).at(-1)  # (N B, ...)
 
-    def decode(self, features: Tensor) -> Tensor:
-        """Give the likelihood's parameters: features `(*, H + D)` to `(*, *O)`."""
-        output: Tensor = self.decoder(features.flatten(0, -2))  # (N, *O)
-        return output.view(*features.shape[:-1], *output.shape[1:])  # (*, *O)
+    def predict(self, filtered: Filtered) -> Tensor:
+        """Give [h_t, s_t] with s_t drawn from the prior, which has not seen o_t, `(B, T, H + D)`."""
+        state, _ = self.prior.rsample(self.prior_context(filtered.hidden))  # (B, T, D)
+        return torch.cat((filtered.hidden, state), -1)  # (B, T, H + D)
+
+    def predictions(self, seen: Seen) -> Prediction:
+        """See `BeliefModel.predictions`: along one posterior trajectory."""
+        features = self.predict(self.filter(seen.embedding, seen.action))
+        return Prediction(features[None], features.new_zeros(1, *features.shape[:2]))  # (1, B, T, H + D), (1, B, T)
 
     def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
         """Estimate the bound with one posterior trajectory per sequence; arguments as in `SequenceBatch`."""
-        return self.bound(self.filter(self.embed(observation), action), observation, mask)
+        seen = self.see(observation, action)
+        return self.bound(self.filter(seen.embedding, action), seen, mask)
 
-    def bound(self, filtered: Filtered, observation: Tensor, mask: Tensor) -> ElboTerms:
-        """Estimate the bound with the posterior trajectory of `filter`."""
+    def bound(self, filtered: Filtered, seen: Seen, mask: Tensor) -> ElboTerms:
+        """Estimate the bound with the posterior trajectory that `filter` has drawn for what was seen."""
         prior_context = self.prior_context(filtered.hidden)  # (B, T, C)
-        log_likelihood = self.likelihood.log_prob(
-            self.decode(filtered.features).float(), self.likelihood.target(observation)
-        )
         return ElboTerms(
-            reconstruction=log_likelihood,
+            reconstruction=self.log_likelihood(filtered.features, seen.target),
             kl=filtered.log_prob - self.prior.log_prob(filtered.state, prior_context),
             analytic_kl=self.posterior.kl(filtered.context, self.prior, prior_context),
             mask=mask,
@@ -226,12 +209,14 @@ class StateSpaceModel(nn.Module):
         Args:
             network: a `perceptron`.
             known: the inputs that do not depend on the recurrence, `(B, T, K)`.
-            loop: to bind it to.
+            loop: to bind it to; its batch is N copies of these B sequences.
         """
         first, *others = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
         cut = first.in_features - known.shape[-1]
         of_loop, of_known = first.weight[:, :cut], first.weight[:, cut:]  # (M, cut), (M, K)
-        layers = [loop.affine(of_loop, linear(known.transpose(0, 1), of_known, first.bias))]  # share (T, B, M)
+        share = linear(known.transpose(0, 1), of_known, first.bias)  # (T, B, M)
+        copies = share[:, None].expand(-1, loop.batch // len(known), -1, -1).flatten(1, 2)  # (T, N B, M)
+        layers = [loop.affine(of_loop, copies)]
         layers += [loop.affine(layer.weight, layer.bias) for layer in others]
 
         def run(x: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from forbes.control.agent import Choice
 from forbes.control.policy import ScalarHead
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.models import Filtered
+from forbes.models import Filtered, StateSpaceModel
 from forbes.models.elbo import ElboTerms
 from forbes.training.world_model import WorldModel, require_at_least
 
@@ -37,6 +37,11 @@ class ActingModel(WorldModel, ABC):
         name = type(self).__name__
         require_at_least(1, name, control_dim=control_dim, control_layers=control_layers)
         require_at_least(0, name, exploration=exploration)
+        if type(self.model) is not StateSpaceModel:
+            raise ForbesError(
+                f"{name}: its model is a {type(self.model).__name__}, expected a StateSpaceModel. Name none"
+            )
+        self.model: StateSpaceModel
         if self.model.action_dim == 0:
             raise ForbesError(
                 f"{name}: the data have no actions, expected some. Choose another source, or a WorldModel"
@@ -50,9 +55,10 @@ class ActingModel(WorldModel, ABC):
 
     def explain(self, batch: SequenceBatch) -> tuple[Filtered, ElboTerms, Tensor]:
         """Filter a batch; give the trajectory, the parts of the bound, and log p(r_t | f_t) in nats, `(B, T)`."""
-        filtered = self.model.filter(self.model.embed(batch.observation), batch.action)
+        seen = self.model.see(batch.observation, batch.action)
+        filtered = self.model.filter(seen.embedding, seen.action)
         error = self.reward(filtered.features) - batch.reward  # (B, T)
-        terms = self.model.bound(filtered, batch.observation, batch.mask)
+        terms = self.model.bound(filtered, seen, batch.mask)
         return filtered, terms, -0.5 * (error.square() + math.log(2 * math.pi))
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:

@@ -80,6 +80,11 @@ class KnownBelief(LightningModule):
         units = Units(state.flatten(0, 1)), Units(inputs.flatten(0, 1))
         self.model = KnownModel(process, belief, *units, hidden_dim, mlp_dim, mlp_layers)
 
+    @property
+    def objective_name(self) -> str:
+        """Name the metric, without its split, that says how the training goes."""
+        return "loss"
+
     def setup(self, stage: str) -> None:
         """Refuse data of another process."""
         self.require_data(self.trainer.datamodule)  # type: ignore[attr-defined]

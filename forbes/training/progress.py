@@ -22,7 +22,9 @@ class TerminalProgress(RichProgressBar):
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """Give what the bar shows at its right."""
-        return {name: round(value, 1 if abs(value) >= 100 else 3) for name, value in _objectives(trainer).items()}
+        return {
+            name: round(value, 1 if abs(value) >= 100 else 3) for name, value in _objectives(trainer, pl_module).items()
+        }
 
 
 class PlainProgress(ProgressBar):
@@ -57,19 +59,21 @@ class PlainProgress(ProgressBar):
         rate = (trainer.global_step - self._first) / elapsed
         total = trainer.estimated_stepping_batches  # infinite for max_epochs: -1
         ends = math.isfinite(total)
+        objectives = _objectives(trainer, pl_module)
         fields = [
             f"epoch {trainer.current_epoch + 1}" + f"/{trainer.max_epochs}" * ends,
             f"update {trainer.global_step}" + f"/{total}" * ends,
             str(timedelta(seconds=round(elapsed))),
             f"{rate:.1f} updates/s",
-            *(f"{name} {value:.{1 if abs(value) >= 100 else 3}f}" for name, value in _objectives(trainer).items()),
+            *(f"{name} {value:.{1 if abs(value) >= 100 else 3}f}" for name, value in objectives.items()),
         ]
         if ends:
             fields.append(f"left {timedelta(seconds=round((total - trainer.global_step) / rate))}")
         print("  ".join(fields), flush=True)
 
 
-def _objectives(trainer: Trainer) -> dict[str, float]:
-    """Give the newest ELBO, or loss in nats per step, of each split."""
+def _objectives(trainer: Trainer, module: LightningModule) -> dict[str, float]:
+    """Give the newest bound, or loss in nats per step, of each split."""
+    objective = getattr(module, "objective_name", "loss")  # a module of somebody else's may have none
     metrics = trainer.callback_metrics.items()
-    return {name: float(value) for name, value in metrics if "/elbo" in name or name.endswith("/loss")}
+    return {name: float(value) for name, value in metrics if name.endswith(f"/{objective}")}

@@ -12,6 +12,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from forbes.beliefs import BeliefFamily, FlowBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
+from forbes.models.base import ModelFamily
 from forbes.models.elbo import ElboTerms, FreeNats, elbo_loss
 from forbes.models.likelihoods import Likelihood, Normal
 from forbes.models.networks import ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily
@@ -30,17 +31,19 @@ class Group(NamedTuple):
 
 
 class WorldModel(LightningModule):
-    """Learns a belief state model of sequences by the ELBO (paper §3.1). Defaults are the paper's for DeepMind Control.
+    """Learns a belief state model of sequences by a bound (paper §3.1). Defaults are the paper's for DeepMind Control.
 
     Args:
         belief: the family of prior and posterior, a class of `forbes.beliefs` with its own arguments.
         prior: the family of the prior, where it is another one: a flow in only one of the two.
+        model: how it filters, a class of `forbes.models` with its own arguments: `StateSpaceModel`, `ParticleModel`
+            (the belief is a set of particles) or `VectorModel` (no stochastic state).
         encoder: o_t to e_t, a class of `forbes.models.networks`.
         decoder: features to the likelihood's parameters, likewise.
         likelihood: what the decoder's output means; `Normal()` by default.
         observation_shape: of one observation; the command line takes it from the data.
         action_dim: A; likewise.
-        state_dim: D of s.
+        state_dim: D of s; 0 for a `VectorModel`.
         hidden_dim: H of the GRU.
         mlp_dim: width of every perceptron.
         mlp_layers: layers of every perceptron.
@@ -62,6 +65,7 @@ class WorldModel(LightningModule):
         self,
         belief: BeliefFamily = FlowBelief,
         prior: BeliefFamily | None = None,
+        model: ModelFamily = StateSpaceModel,
         encoder: EncoderFamily = ConvEncoder,
         decoder: DecoderFamily = ConvDecoder,
         likelihood: Likelihood | None = None,
@@ -82,11 +86,9 @@ class WorldModel(LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        require_at_least(
-            1, "WorldModel", state_dim=state_dim, hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers
-        )
-        require_at_least(0, "WorldModel", learning_rate=learning_rate, clip_norm=clip_norm)
-        self.model = StateSpaceModel(
+        require_at_least(1, "WorldModel", hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers)
+        require_at_least(0, "WorldModel", state_dim=state_dim, learning_rate=learning_rate, clip_norm=clip_norm)
+        self.model = model(
             belief,
             encoder(observation_shape),
             decoder(hidden_dim + state_dim, observation_shape),
@@ -101,6 +103,11 @@ class WorldModel(LightningModule):
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.learning_rate, self.schedule, self.warmup = learning_rate, schedule, warmup
         self.clip_norm, self.seed = clip_norm, seed
+
+    @property
+    def objective_name(self) -> str:
+        """Name the metric, without its split, that says how the training goes."""
+        return self.model.bound_name
 
     def terms(self, batch: SequenceBatch) -> ElboTerms:
         """Estimate the parts of the bound on a batch."""
@@ -167,14 +174,14 @@ class WorldModel(LightningModule):
             self.log(f"train/gradient_norm_{group.name}", norm)
 
     def _log(self, split: str, terms: ElboTerms) -> None:
-        """Log per-sequence means in nats; the bound's name holds its likelihood and number of samples."""
-        count = len(terms.mask)
-        values = {
-            f"{split}/elbo[{self.model.likelihood.name},S=1]": terms.elbo.mean(),
-            f"{split}/reconstruction": (terms.reconstruction * terms.mask).sum(1).mean(),
-            f"{split}/kl": (terms.kl * terms.mask).sum(1).mean(),
+        """Log means in nats per sequence, auxiliary losses per step; the bound's name is the model's."""
+        parts = {
+            "reconstruction": (terms.reconstruction * terms.mask).sum(1).mean(),
+            "kl": (terms.kl * terms.mask).sum(1).mean(),
+            **terms.auxiliary,
         }
-        self.log_dict({name: value.detach() for name, value in values.items()}, batch_size=count)
+        values = {self.objective_name: terms.elbo.mean()} | {name: parts[name] for name in self.model.parts}
+        self.log_dict({f"{split}/{name}": value.detach() for name, value in values.items()}, batch_size=len(terms.mask))
 
 
 def require_at_least(least: float, where: str, **numbers: Any) -> None:

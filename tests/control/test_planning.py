@@ -68,8 +68,8 @@ def test_plans_on_the_beliefs_of_any_family(belief):
     model = StateSpaceModel(belief, MLPEncoder((3,), 8, 1), MLPDecoder(20, (3,), 8, 1), VectorNormal(), 2, 4, 16, 8, 1)
     search = CrossEntropy(horizon=5, iterations=2, candidates=20, best=5)
 
-    filtered = model.filter(model.embed(torch.randn(3, 6, 3)), torch.randn(3, 6, 2))
-    action = plan(model, lambda features: features.sum(-1), model.beliefs(filtered, 5, 20), 2, search)
+    beliefs = model.beliefs(model.see(torch.randn(3, 6, 3), torch.randn(3, 6, 2)), 20)
+    action = plan(model, lambda features: features.sum(-1), beliefs, 2, search)
 
     assert action.shape == (3, 2)
     assert (action.abs() <= 1).all()

@@ -1,5 +1,7 @@
 """The evaluated bound is its definition, sequence by sequence and step by step."""
 
+from functools import partial
+
 import pytest
 import torch
 from torch import nn
@@ -9,7 +11,8 @@ from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.evaluation.bounds import trajectories
 from forbes.evaluation.scoring import make_pass, score_split
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, Normal, StateSpaceModel
+from forbes.evaluation.smc import score_particles
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, Normal, ParticleModel, StateSpaceModel
 from forbes.seeding import derive_seed
 
 SHAPE, STEPS = (1, 4, 4), 5
@@ -30,10 +33,10 @@ class Certain(BeliefHead):
         return -(state - context[..., : self.state_dim]).square().sum(-1)
 
 
-def make_model(belief=Certain, likelihood=None, actions=2):
+def make_model(belief=Certain, likelihood=None, actions=2, build=StateSpaceModel):
     torch.manual_seed(0)
     encoder, decoder = MLPEncoder(SHAPE, 6, 1), MLPDecoder(4 + 3, SHAPE, 6, 1)
-    model = StateSpaceModel(belief, encoder, decoder, likelihood or Bernoulli(), actions, 3, 4, 8, 2)
+    model = build(belief, encoder, decoder, likelihood or Bernoulli(), actions, 3, 4, 8, 2)
     return model.double().eval()
 
 
@@ -116,6 +119,18 @@ def test_its_samples_are_estimates_of_the_bound_that_is_trained(belief):
     for trajectory, terms in zip(drawn, expected, strict=True):
         torch.testing.assert_close(trajectory.reconstruction, terms.reconstruction)
         torch.testing.assert_close(trajectory.kl, terms.kl)
+
+
+def test_the_fivo_bound_is_the_one_that_particles_are_trained_by():
+    model, batch = make_model(GaussianBelief, build=partial(ParticleModel, particles=5)), make_batch()
+    torch.manual_seed(3)
+    scores = score_particles(model, batch, 5)
+    torch.manual_seed(3)
+    with torch.no_grad():
+        terms = model.elbo(batch.observation, batch.action, batch.mask)
+
+    torch.testing.assert_close(scores["fivo"].sum(1), terms.elbo)
+    assert (scores["ess"][batch.mask] < 0.5).any()
 
 
 def test_the_reported_value_is_the_mean_over_samples_and_depends_on_the_seed_alone():

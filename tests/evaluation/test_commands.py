@@ -13,10 +13,13 @@ from forbes.cli import main
 from forbes.evaluation import scoring
 from forbes.evaluation.runs import load_runs, split_batches
 from forbes.evaluation.scoring import Parts, make_pass, score_split
+from forbes.training.loading import load_run
 from forbes.training.run_folder import RunFolder
 
 NAME = "test/elbo[bernoulli,S=2]"
 RSSM = ["--model.init_args.belief", "GaussianBelief"]
+VECTOR = ["--model.init_args.model", "VectorModel", "--model.init_args.state_dim", "0"]
+PARTICLE = [*RSSM, "--model.init_args.model", "ParticleModel", "--model.init_args.model.init_args.particles", "2"]
 
 
 def fit(config, run, *arguments):
@@ -36,6 +39,14 @@ def trained(tiny_run, tiny_config, tmp_path_factory):
 def runs(trained, tmp_path):
     """Copies that a test may change."""
     return [str(shutil.copytree(run, tmp_path / run.name)) for run in trained]
+
+
+@pytest.fixture(scope="module")
+def other_filters(tiny_config, tmp_path_factory):
+    """A run of each model whose filter is another; not to be changed but by evaluations."""
+    folder = tmp_path_factory.mktemp("filters")
+    kinds = {"vector": VECTOR, "particle": PARTICLE}
+    return [str(fit(tiny_config, folder / name, *flags)) for name, flags in kinds.items()]
 
 
 def evaluate(*arguments):
@@ -106,6 +117,38 @@ def test_every_score_is_measured_by_default_and_named_with_its_numbers(runs, cap
     assert not any(entries["test[:5]/open_loop[bernoulli,K=4,c=2]"]["curve"][:2])
     out = capsys.readouterr().out
     assert all(name in out for name in ("elbo", "iwae", "pll", "fivo", "open_loop", "[bernoulli,K=4,c=2]"))
+
+
+def test_a_score_that_a_model_does_not_have_is_left_out_and_said(runs, other_filters, capsys):
+    vector, particle = other_filters
+    numbers = ["--samples", "2", "--particles", "4", "--futures", "4", "--context", "2", "--digits", "5"]
+    assert main(["evaluate", vector, runs[1], particle, *numbers]) == 0
+
+    full, of_vector, of_particle = (record(run) for run in (runs[1], vector, particle))
+    assert list(of_particle) == list(full)
+    assert list(of_vector) == [name for name in full if "pll" in name or "open_loop" in name]
+    assert {pair["minus"] for pair in full["test[:5]/pll[bernoulli,K=4]"]["paired"]} == {vector, particle}
+    assert {pair["minus"] for pair in full["test[:5]/fivo[bernoulli,K=4]"]["paired"]} == {particle}
+    lines = capsys.readouterr().out.splitlines()
+    table = {line.split("│")[2].strip(): line for line in lines if line.count("│") > 10}
+    assert table["Vector"].count("n/a") == 6
+    assert "n/a" not in table["RSSM wide"] + table["Particle"]
+    assert len([line for line in lines if line.count("n/a") == 3]) == 2  # its differences to the two others
+
+    module, data = load_run(vector)
+    batch = data.sequences("test", torch.arange(5))
+    with torch.no_grad():
+        log_p = module.model.elbo(batch.observation, batch.action, batch.mask).elbo
+    np.testing.assert_allclose(arrays_of(vector)["test[:5]/pll[bernoulli,K=4]"], log_p.numpy(), rtol=1e-6)
+
+
+def test_scores_and_numbers_that_cannot_be_are_said_in_one_sentence(other_filters, capsys):
+    vector, particle = other_filters
+    expected = "a Vector model has no elbo or fivo score, its likelihood is exact. Ask for --scores pll or open-loop"
+    assert expected in error_of(capsys, vector, "--scores", "elbo", "fivo")
+    message = error_of(capsys, particle, "--scores", "pll", "--particles", "3")
+    assert "3 particles or futures, expected whole sets of 2" in message
+    assert evaluate(particle, "--scores", "fivo", "--particles", "3", "--digits", "2") == 0  # of any number
 
 
 def test_data_of_a_known_process_add_its_exact_likelihood(tmp_path, capsys):

@@ -71,8 +71,7 @@ def test_a_sample_keeps_its_own_trajectory(model, batch):
 
     with torch.no_grad():
         torch.manual_seed(0)
-        filtered = model.filter(model.embed(batch.observation[:, :4]), batch.action[:, :4])
-        starts = model.beliefs(filtered, 3, 3)
+        starts = model.beliefs(model.see(batch.observation[:, :4], batch.action[:, :4]), 3)
         for n in range(3):
             for b in range(5):
                 row = n * 5 + b

@@ -4,14 +4,15 @@ Its posterior is p(s_t | s_{t-1}, o_t): exact for the first state, blind to late
 """
 
 import math
+from functools import partial
 
 import pytest
 import torch
 from linear_gaussian import drawn, gaussian, log_evidence
 
 from forbes.data import SequenceBatch
-from forbes.evaluation import score_open_loop, score_particles, score_trajectories
-from forbes.evaluation.smc import effective_sample_size, systematic_resampling
+from forbes.evaluation import score_open_loop, score_particles, score_predictions, score_trajectories
+from forbes.models import ParticleModel
 
 ROUNDING = 1e-4  # of float32, in nats
 
@@ -124,18 +125,42 @@ def test_the_open_loop_score_is_the_logarithm_of_the_mean_of_likelihoods():
     assert many > one.mean() + 4 * error
 
 
-def test_systematic_resampling_chooses_each_particle_as_often_as_its_weight_says():
-    log_weight = torch.tensor([0.5, 0.25, 0.2, 0.05], dtype=torch.float64).log()[:, None].expand(4, 1000)
-    uniform = (torch.arange(1000, dtype=torch.float64) + 0.5) / 1000
+@pytest.fixture
+def poor_particles():
+    """A model of 250 particles whose proposal lies aside, one sequence, and log p(o_{1:t}) for each t."""
+    model, exact = gaussian(partial(ParticleModel, particles=250))
+    with torch.no_grad():
+        model.posterior.parameters_of.bias[:2] += 0.2
+    observation = drawn(6, seed=6)
+    torch.manual_seed(0)
+    return model, observation, torch.stack([log_evidence(observation[: t + 1], *exact) for t in range(6)])
 
-    chosen = systematic_resampling(log_weight, uniform)
-    counts = torch.nn.functional.one_hot(chosen, 4).sum(0)  # (1000, 4)
 
-    expected = 4 * log_weight[:, 0].exp()
-    assert (counts.double() - expected).abs().max() < 1  # the floor or the ceiling of K W_k
-    torch.testing.assert_close(counts.double().mean(0), expected, rtol=0, atol=1e-3)  # the grid of u
+def test_the_prequential_score_of_particles_reaches_the_evidence_where_trajectories_do_not(poor_particles):
+    model, observation, evidence = poor_particles
+
+    pll = score_predictions(model, copies(observation, 25), 500)["pll"].sum(1)
+    trajectories = score_trajectories(model, copies(observation, 20), 100, predict=True)["pll"].sum(1)
+
+    error = 4 * pll.std() / math.sqrt(25)
+    bias = 0.05  # six times a mean over 500 inside the logarithm, and over weighted particles
+    assert abs(pll.mean() - evidence[-1]) < error + bias
+    assert trajectories.mean() < evidence[-1] - 5 * (error + bias)
 
 
-def test_the_effective_sample_size_counts_equal_weights():
-    weight = torch.tensor([[1.0, 0.5, 0.25], [0.0, 0.5, 0.25], [0.0, 0.0, 0.25], [0.0, 0.0, 0.25]])
-    torch.testing.assert_close(effective_sample_size(weight.log()), torch.tensor([1.0, 2.0, 4.0]))
+def test_the_open_loop_score_of_particles_is_the_likelihood_of_the_rest(poor_particles):
+    model, observation, evidence = poor_particles
+
+    scores = score_open_loop(model, copies(observation, 40), 2500, context=3)["open_loop"].sum(1)
+
+    expected = evidence[-1] - evidence[2]
+    assert abs(scores.mean() - expected) < 4 * scores.std() / math.sqrt(40) + scores.var() / 2 + 0.05
+
+
+def test_particles_are_scored_by_the_bound_of_any_number_of_them(poor_particles):
+    """FIVO is of the model and its proposal; the number it was trained with does not count."""
+    model, observation, evidence = poor_particles
+
+    fivo = score_particles(model, copies(observation, 16), 2000)["fivo"].sum(1)
+
+    assert abs(fivo.mean() - evidence[-1]) < 4 * fivo.std() / 4 + fivo.var() / 2 + ROUNDING

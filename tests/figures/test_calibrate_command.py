@@ -9,13 +9,16 @@ from forbes.cli import main
 CONFIG = Path(__file__).parents[2] / "configs" / "pomdp" / "linear_gaussian" / "rssm.yaml"
 
 
+def fit(folder, *flags):
+    """A world model of vectors that has made one update."""
+    small = ["--data.updates_per_epoch=1", "--trainer.max_epochs=1", "--trainer.log_every_n_steps=1"]
+    assert main(["fit", "--config", str(CONFIG), *small, *flags, "--run_dir", str(folder)]) == 0
+    return str(folder)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A world model of vectors that has made one update."""
-    folder = tmp_path_factory.mktemp("calibrated") / "rssm"
-    small = ["--data.updates_per_epoch=1", "--trainer.max_epochs=1", "--trainer.log_every_n_steps=1"]
-    assert main(["fit", "--config", str(CONFIG), *small, "--run_dir", str(folder)]) == 0
-    return str(folder)
+    return fit(tmp_path_factory.mktemp("calibrated") / "rssm")
 
 
 def test_it_prints_the_coverage_and_draws_the_ranks(run, tmp_path, capsys):
@@ -43,3 +46,14 @@ def test_what_cannot_be_checked_is_said_in_one_sentence(run, tmp_path, capsys, f
     (line,) = capsys.readouterr().err.splitlines()
     assert expected in line
     assert list(tmp_path.iterdir()) == []
+
+
+def test_particles_are_ranked_and_a_model_without_a_state_is_refused(tmp_path, capsys):
+    numbers = ["--sequences", "60", "--samples", "19", "--time", "3", "-o", str(tmp_path / "figures")]
+    particle = fit(tmp_path / "particle", "--model.model", "ParticleModel", "--model.model.particles", "4")
+    vector = fit(tmp_path / "vector", "--model.model", "VectorModel", "--model.state_dim", "0")
+
+    assert main(["calibrate", particle, *numbers]) == 0
+    assert "Particle" in capsys.readouterr().out
+    assert main(["calibrate", vector, *numbers]) == 2
+    assert "a Vector model has no state that could be ranked" in capsys.readouterr().err

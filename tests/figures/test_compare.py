@@ -1,6 +1,7 @@
 """`forbes compare`: trains, measures and puts side by side; interrupted, it goes on."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ import pandas as pd
 import pytest
 
 from forbes.cli import main
-from forbes.evaluation.comparison import Family, compare
+from forbes.evaluation.comparison import Comparison, Family, compare
+from forbes.evaluation.measured import score_of
 from forbes.evaluation.record import read_arrays
 from forbes.figures import compare_command
 from forbes.figures.comparison import differences, per_step, scores
@@ -87,6 +89,50 @@ def test_the_pictures_are_there_and_show_the_values(compared, families):
 
     (panel,) = differences(comparison, "rssm").axes
     assert panel.texts[0].get_text() == f"{comparison.differences['mean'].mean():+.2f}"
+
+
+def test_a_score_that_a_family_does_not_have_is_empty_in_tables_and_pictures(configs, compared, tmp_path, monkeypatch):
+    vector = tmp_path / "vector.yaml"
+    flows = "{class_path: FlowBelief, init_args: {layers: 2, width: 4}}"
+    text = Path(configs[1]).read_text().replace(f"belief: {flows}", "model: VectorModel")
+    vector.write_text(text.replace("state_dim: 2", "state_dim: 0"))
+    folder = shutil.copytree(compared, tmp_path / "compared")
+    monkeypatch.setattr(compare_command, "_forbes_fit", in_this_process)
+
+    assert main(["compare", str(vector), *configs, "-o", str(folder), *MEASURES]) == 0
+
+    table = pd.read_csv(folder / "comparison.csv").set_index(["metric", "family"])
+    pll = next(name for name in table.index.levels[0] if "/pll[" in name)
+    record = json.loads((folder / "comparison.json").read_text())  # which has no NaN
+    text = (folder / "comparison.md").read_text()
+    rows = {line.split("|")[1].strip(" `"): line for line in text.split("Paired")[0].splitlines() if line[:1] == "|"}
+    assert np.isnan(table.loc[(ELBO, "vector"), "mean"])
+    assert np.isfinite(table.loc[(pll, "vector"), "mean"])
+    assert table.loc[(ELBO, "vector"), "parameters"] == table.loc[(pll, "vector"), "parameters"] > 0
+    blank = [row for row in record["scores"] if row["mean"] is None]
+    assert {row["family"] for row in blank} == {"vector"}
+    assert ELBO in {row["metric"] for row in blank}
+    assert "n/a" in rows[ELBO]
+    assert "n/a" not in rows[pll]
+    assert {score_of(row["metric"]) for row in record["differences"]} == {"pll", "open_loop"}
+
+    families = [Family(name, {0: str(folder / f"{name}-0")}) for name in ("rssm", "vector")]
+    families[1] = families[1]._replace(lacks=[ELBO])
+    comparison = compare(families, [ELBO, pll])
+    elbo, of_pll = per_step(comparison).axes
+    assert [line.get_label() for line in elbo.lines] == ["rssm"]
+    assert {line.get_label(): line.get_color() for line in of_pll.lines}["rssm"] == elbo.lines[0].get_color()
+    legend = per_step(comparison).legends[0]
+    assert [entry.get_text() for entry in legend.get_texts()] == ["rssm", "vector"]
+
+
+def test_a_difference_that_two_families_do_not_have_says_so():
+    rows = [("a", "test/elbo[S=1]", 1.0), ("a", "test/pll[K=1]", 2.0), ("b", "test/pll[K=1]", -1.0)]
+    table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
+
+    (panel,) = differences(Comparison(table, table, {}), "first").axes
+
+    assert [text.get_text() for text in panel.texts] == ["+1.00", "+2.00", "n/a", "-1.00"]
 
 
 def test_given_again_it_trains_and_measures_nothing(configs, compared, monkeypatch, capfd):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -83,7 +84,7 @@ def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo
         metric = {"test/elbo[bernoulli,S=16]": {"mean": mean, "standard_error": 1.0}}
         (tmp_path / copy / "evaluation.json").write_text(json.dumps(metric))
 
-    (axes,) = elbo_against_updates(group(load_runs(copies)), "ELBO").axes
+    (axes,) = elbo_against_updates(group(load_runs(copies))).axes
 
     forbes, marker, rssm, _ = axes.lines
     curves = [read_metrics(run)["val/elbo[bernoulli,S=1]"].dropna() for run in runs]
@@ -100,9 +101,32 @@ def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo
 
 def test_a_family_is_drawn_where_all_its_runs_have_values():
     curves = [pd.Series([-3.0, -2.0, -1.0], [10, 20, 30]), pd.Series([-5.0, -4.0], [10, 20])]
-    (axes,) = elbo_against_updates([Family("A", BLUE, torch.nn.Identity(), curves, [])], "ELBO").axes
+    (axes,) = elbo_against_updates([Family("A", BLUE, SimpleNamespace(bound_name="elbo[S=1]"), curves, [])]).axes
+    assert axes.get_ylabel() == "validation ELBO[S=1]\nnats per sequence"
     assert list(axes.lines[0].get_xdata()) == [10, 20]
     assert list(axes.lines[0].get_ydata()) == [-4.0, -3.0]
+
+
+def test_families_of_other_bounds_are_drawn_by_their_own(runs, tiny_config, tmp_path):
+    particle, vector = (str(tmp_path / name) for name in ("particle", "vector"))
+    fit = ["fit", "--config", str(tiny_config), "--run_dir"]
+    assert main([*fit, particle, *RSSM, "--model.model", "ParticleModel", "--model.model.particles", "2"]) == 0
+    assert main([*fit, vector, "--model.model", "VectorModel", "--model.state_dim", "0"]) == 0
+    for run, metric in [(particle, "test/elbo[bernoulli,S=16]"), (vector, "test/pll[bernoulli,K=128]")]:
+        (tmp_path / run / "evaluation.json").write_text(json.dumps({metric: {"mean": -90.0}}))
+    families = group(load_runs([runs[0], particle, vector]))
+
+    (axes,) = elbo_against_updates(families).axes
+
+    assert axes.get_ylabel() == "validation bound\nnats per sequence"
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+        "FORBES, elbo[bernoulli,S=1]",
+        "Particle, fivo[bernoulli,K=2]",
+        "Vector, log_p[bernoulli]",
+    ]  # and no diamond: an ELBO on the test split is not what these curves end in
+    expected = read_metrics(vector)["val/log_p[bernoulli]"].dropna()
+    assert axes.lines[2].get_ydata() == pytest.approx(expected)
+    assert draw([runs[0], particle, vector], tmp_path / "figures", "--index", "3") == 0
 
 
 def make_strokes(path, prefixes):

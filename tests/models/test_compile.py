@@ -6,18 +6,32 @@ import pytest
 import torch
 
 from forbes.beliefs import FlowBelief, GaussianBelief
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, StateSpaceModel, elbo_loss
+from forbes.models import (
+    Bernoulli,
+    MLPDecoder,
+    MLPEncoder,
+    ParticleModel,
+    StateSpaceModel,
+    VectorModel,
+    elbo_loss,
+)
 
 SHAPE = (1, 4, 4)
+MODELS = {  # and D
+    "gaussian": (partial(StateSpaceModel, GaussianBelief), 2),
+    "flow": (partial(StateSpaceModel, partial(FlowBelief, layers=2, width=4)), 2),
+    "particles": (partial(ParticleModel, GaussianBelief, particles=3, resampling="soft"), 2),
+    "vector": (partial(VectorModel, GaussianBelief, overshoot=1), 0),
+}
 
 
-@pytest.fixture(params=[GaussianBelief, partial(FlowBelief, layers=2, width=4)], ids=["gaussian", "flow"], name="model")
+@pytest.fixture(params=MODELS, name="model")
 def model_fixture(request):
     torch.manual_seed(0)
-    encoder, decoder = MLPEncoder(SHAPE, 8, 1), MLPDecoder(6 + 2, SHAPE, 8, 1)
-    return StateSpaceModel(
-        request.param, encoder, decoder, Bernoulli(), action_dim=1, state_dim=2, hidden_dim=6, mlp_dim=8, mlp_layers=1
-    )
+    build, state_dim = MODELS[request.param]
+    encoder, decoder = MLPEncoder(SHAPE, 8, 1), MLPDecoder(6 + state_dim, SHAPE, 8, 1)
+    sizes = {"action_dim": 1, "state_dim": state_dim, "hidden_dim": 6, "mlp_dim": 8, "mlp_layers": 1}
+    return build(encoder, decoder, Bernoulli(), **sizes)
 
 
 @pytest.fixture(autouse=True)

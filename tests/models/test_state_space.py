@@ -4,78 +4,26 @@ from functools import partial
 
 import pytest
 import torch
+from small_models import (
+    BATCH,
+    HIDDEN,
+    SHAPE,
+    STATE,
+    STATE_SPACE,
+    TIME,
+    make_model,
+    random_model,
+    random_state,
+    sequences,
+)
 
-from forbes.beliefs import FlowBelief, GaussianBelief
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, State, StateSpaceModel, elbo_loss
-
-BATCH, TIME, ACTION, STATE, HIDDEN = 5, 6, 2, 4, 7
-SHAPE = (1, 6, 6)
-FLOW = partial(FlowBelief, layers=3, width=8)
-FAMILIES = {  # of the posterior, and of the prior where it is another
-    "gaussian": (GaussianBelief, None),
-    "flow": (FLOW, None),
-    "flow in the posterior": (FLOW, GaussianBelief),
-    "flow in the prior": (GaussianBelief, FLOW),
-}
+from forbes.beliefs import GaussianBelief
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, StateSpaceModel
 
 
-@pytest.fixture(params=FAMILIES, name="family")
+@pytest.fixture(params=STATE_SPACE, name="family")
 def family_fixture(request):
-    return FAMILIES[request.param]
-
-
-@pytest.fixture
-def same_noise(monkeypatch):
-    """Make every draw the same vector: then no step and no row can differ by its noise."""
-
-    def randn(*shape, **options):
-        return torch.linspace(-1, 1, shape[-1], **options).expand(shape)
-
-    monkeypatch.setattr(torch, "randn", randn)
-
-
-class Bernoulli64(Bernoulli):
-    """Pixels for a model in float64."""
-
-    def target(self, observation):
-        return observation.double()
-
-
-def make_model(family, action_dim=ACTION, width=9, seed=0):
-    belief, prior = family
-    torch.manual_seed(seed)
-    return StateSpaceModel(
-        belief,
-        MLPEncoder(SHAPE, width, layers=1),
-        MLPDecoder(HIDDEN + STATE, SHAPE, width, layers=1),
-        Bernoulli64(),
-        action_dim,
-        state_dim=STATE,
-        hidden_dim=HIDDEN,
-        mlp_dim=width,
-        mlp_layers=2,
-        prior=prior,
-    ).double()
-
-
-def random_model(family, seed=0):
-    """A model with no weight where it starts: an untrained flow is the identity and would hide mistakes."""
-    model = make_model(family, seed=seed)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.1 * torch.rand_like(parameter).sub(0.5)
-    return model
-
-
-def sequences(seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    observation = torch.randint(2, (BATCH, TIME, *SHAPE), generator=generator, dtype=torch.uint8)
-    action = torch.rand(BATCH, TIME, ACTION, generator=generator, dtype=torch.float64)
-    return observation, action, torch.ones(BATCH, TIME, dtype=torch.bool)
-
-
-def random_state(batch=BATCH):
-    return State(torch.rand(batch, HIDDEN, dtype=torch.float64), torch.rand(batch, STATE, dtype=torch.float64))
+    return request.param
 
 
 def step_by_step(model, observation, action):
@@ -159,23 +107,8 @@ def test_no_step_sees_later_observations_or_actions(family):
         assert by_action.ne(0).any(-1).any(0).tolist() == [step <= t for step in range(TIME)]
 
 
-@pytest.mark.usefixtures("same_noise")
-def test_a_batch_of_one_equals_that_row_of_a_batch(family):
-    model, (observation, action, mask) = random_model(family), sequences()
-
-    batch = model.elbo(observation, action, mask)
-    row = model.elbo(observation[2:3], action[2:3], mask[2:3])
-    start = random_state()
-    rollout, alone = model.imagine(start, action), model.imagine(State(*(x[2:3] for x in start)), action[2:3])
-
-    torch.testing.assert_close(row.reconstruction, batch.reconstruction[2:3], rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(row.kl, batch.kl[2:3])
-    for of_row, of_batch in zip(alone, rollout, strict=True):
-        torch.testing.assert_close(of_row, of_batch[2:3])
-
-
 def test_an_untrained_flow_model_equals_the_gaussian_one_in_every_term():
-    gaussian, flow = make_model(FAMILIES["gaussian"], seed=0), make_model(FAMILIES["flow"], seed=1)
+    gaussian, flow = make_model("gaussian", seed=0), make_model("flow", seed=1)
     missing, unexpected = flow.load_state_dict(gaussian.state_dict(), strict=False)
     flow.prior.base.load_state_dict(gaussian.prior.state_dict())
     flow.posterior.base.load_state_dict(gaussian.posterior.state_dict())
@@ -193,27 +126,6 @@ def test_an_untrained_flow_model_equals_the_gaussian_one_in_every_term():
 
     for expected, got in zip(*results, strict=True):
         torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-6)
-
-
-def test_gradients_reach_every_parameter(family):
-    model = random_model(family)
-
-    elbo_loss(model.elbo(*sequences())).backward()
-
-    assert [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()] == []
-
-
-def test_gradients_of_an_untrained_model_reach_every_parameter_at_the_second_update(family):
-    """The flow's last layers start at zero and block those before them, once."""
-    model = make_model(family)
-    optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
-
-    for _ in range(2):
-        optimizer.zero_grad()
-        elbo_loss(model.elbo(*sequences())).backward()
-        optimizer.step()
-
-    assert [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()] == []
 
 
 def test_a_second_backward_pass_gives_the_same_gradients(family):
@@ -259,45 +171,10 @@ def test_a_frozen_model_passes_gradients_to_the_actions(family, same_noise):
     assert expected.ne(0).any(-1).all()
 
 
-def test_padding_changes_neither_loss_nor_gradients(family):
-    model, (observation, action, mask) = random_model(family), sequences()
-    mask[0, 2:] = mask[3, 5:] = False
-    noisy_observation = torch.where(mask[..., None, None, None], observation, 1 - observation)
-    noisy_action = torch.where(mask[..., None], action, 100.0)
-    results = []
-
-    for inputs in [(observation, action), (noisy_observation, noisy_action)]:
-        torch.manual_seed(0)
-        loss = elbo_loss(model.elbo(*inputs, mask), free_nats=0.1, free_nats_per="element")
-        results.append((loss, *torch.autograd.grad(loss, list(model.parameters()))))
-
-    torch.testing.assert_close(results[0], results[1], rtol=0, atol=0)
-
-
-def test_cutting_padding_off_changes_nothing(family):
-    model, (observation, action, mask) = random_model(family), sequences()
-    mask[:, 4:] = False
-
-    torch.manual_seed(0)
-    padded = elbo_loss(model.elbo(observation, action, mask))
-    torch.manual_seed(0)
-    cut = elbo_loss(model.elbo(observation[:, :4], action[:, :4], mask[:, :4]))
-
-    torch.testing.assert_close(padded, cut)
-
-
-def test_a_process_without_actions_needs_no_dummy(family):
-    model, (observation, _, mask) = make_model(family, action_dim=0), sequences()
-    no_action = torch.zeros(BATCH, TIME, 0, dtype=torch.float64)
-
-    assert model.elbo(observation, no_action, mask).elbo.isfinite().all()
-    assert model.imagine(model.initial(BATCH), no_action).state.shape == (BATCH, TIME, STATE)
-
-
 @pytest.mark.usefixtures("same_noise")
 def test_imagination_is_the_plain_loop_over_the_prior(family):
     model, (_, action, _) = random_model(family), sequences()
-    hidden, state = start = random_state()
+    hidden, state = start = random_state(model)
 
     rollout = model.imagine(start, action)
 
@@ -307,26 +184,6 @@ def test_imagination_is_the_plain_loop_over_the_prior(family):
         state, log_prob = model.prior.rsample(model.prior_context(hidden))
         torch.testing.assert_close(rollout.features[:, t], torch.cat((hidden, state), -1))
         torch.testing.assert_close(rollout.log_prob[:, t], log_prob)
-
-
-def test_belief_samples_keep_the_history_they_belong_to(family, same_noise):
-    model, (observation, action, _) = random_model(family), sequences()
-    filtered = model.filter(model.embed(observation), action)
-
-    hidden, state = (values.unflatten(0, (3, BATCH)) for values in model.beliefs(filtered, time=4, samples=3))
-
-    for sample in range(3):
-        torch.testing.assert_close(hidden[sample], filtered.hidden[:, 4])
-        torch.testing.assert_close(state[sample], filtered.state[:, 4])  # with the same noise
-
-
-def test_belief_samples_differ(family):
-    model, (observation, action, _) = random_model(family), sequences()
-
-    beliefs = model.beliefs(model.filter(model.embed(observation), action), time=4, samples=3)
-
-    assert len(beliefs.state.unique(dim=0)) == 3 * BATCH
-    assert len(beliefs.hidden.unique(dim=0)) == BATCH
 
 
 def bistable_model():
@@ -368,46 +225,3 @@ def test_in_imagination_one_mode_stays_one_mode():
     assert states.abs().min() > 3 - 5 * 0.5
     share = sides[:, 0].float().mean(0)  # of each dimension in the upper mode
     assert ((share - 0.5).abs() < 4 * 0.5 / samples**0.5).all(), "the modes are not equally likely"
-
-
-def test_decoding_keeps_the_leading_dimensions():
-    model = random_model(FAMILIES["gaussian"])
-    features = torch.rand(2, 3, HIDDEN + STATE, dtype=torch.float64)
-
-    output = model.decode(features)
-
-    assert output.shape == (2, 3, *SHAPE)
-    torch.testing.assert_close(output[1, 2], model.decoder(features[1, 2:3])[0])
-
-
-def test_a_saved_and_loaded_model_gives_identical_outputs(family, tmp_path):
-    model, other, batch = random_model(family, seed=0), random_model(family, seed=1), sequences()
-    torch.save(model.state_dict(), tmp_path / "model.pt")
-    other.load_state_dict(torch.load(tmp_path / "model.pt", weights_only=True))
-    results = []
-
-    for each in (model, other):
-        torch.manual_seed(0)
-        terms = each.elbo(*batch)
-        rollout = each.imagine(each.initial(BATCH), batch[1])
-        results.append((terms.reconstruction, terms.kl, *rollout))
-
-    torch.testing.assert_close(results[0], results[1], rtol=0, atol=0)
-
-
-def test_overfits_one_batch(family):
-    """A random pixel costs 0.69 nats until it is remembered, then what it takes to say which of the five sequences."""
-    model, batch = make_model(family, width=64), sequences()
-    optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
-    torch.manual_seed(0)
-
-    losses = []
-    for _ in range(300):
-        loss = elbo_loss(model.elbo(*batch))
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-
-    assert losses[0] > 20
-    assert sum(losses[-20:]) / 20 < losses[0] / 3

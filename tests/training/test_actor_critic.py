@@ -64,8 +64,9 @@ def gradients(loss, modules):
 def test_the_world_model_learns_from_its_own_loss_only():
     ours, batch = agent(), make_batch()
     torch.manual_seed(1)
-    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
-    terms = ours.model.bound(filtered, batch.observation, batch.mask)
+    seen = ours.model.see(batch.observation, batch.action)
+    filtered = ours.model.filter(seen.embedding, seen.action)
+    terms = ours.model.bound(filtered, seen, batch.mask)
     reward = torch.distributions.Normal(ours.reward(filtered.features), 1.0).log_prob(batch.reward)
 
     own = gradients(ours.loss(terms) - reward.mean(), [ours.model, ours.reward])

@@ -71,13 +71,33 @@ def test_a_training_with_callbacks_is_bitwise_the_one_without(watched, tiny_run)
     [
         ["--model.init_args.belief", "GaussianBelief", "--model.init_args.state_dim", "3"],
         ["--model.init_args.likelihood", "Normal"],
+        ["--model.init_args.model", "ParticleModel", "--model.init_args.model.init_args.particles", "2"],
     ],
-    ids=["gaussian, 3-d", "normal likelihood"],
+    ids=["gaussian, 3-d", "normal likelihood", "particles"],
 )
 def test_every_family_and_likelihood_is_drawn(arguments, tiny_config, callbacks, tmp_path):
     configs = ["--config", str(tiny_config), "--config", str(callbacks)]
     assert main(["fit", *configs, "--run_dir", str(tmp_path), *arguments]) == 0
     assert all(is_picture(tmp_path / "figures" / name) for name in PICTURES)
+
+
+def test_a_model_without_a_state_has_no_belief_to_plot_and_all_the_rest(tiny_config, callbacks, tmp_path, capsys):
+    flags = ["--config", str(tiny_config), "--model.model", "VectorModel", "--model.state_dim", "0"]
+    assert main(["fit", *flags, "--config", str(callbacks), "--run_dir", str(tmp_path / "refused")]) == 2
+    assert "BeliefPlot: VectorModel has no state to plot. Leave this callback out" in capsys.readouterr().err
+    assert not RunFolder(tmp_path / "refused").checkpoint.exists()
+    run = tmp_path / "run"
+    assert main(["fit", *flags, "--run_dir", str(run)]) == 0
+
+    curves, grid = draw(ElboCurve(6), run), draw(PredictionGrid(3, 2, 3), run)
+
+    assert [axes.get_title() for axes in curves.axes] == ["log_p[bernoulli]", "loss of the roll-out"]
+    metrics = read_metrics(run)
+    for axes, name in zip(curves.axes, ["log_p[bernoulli]", "overshoot"], strict=True):
+        assert axes.lines[1].get_ydata() == pytest.approx(metrics[f"val/{name}"].dropna())
+    assert [axes.get_title() for axes in grid.axes][2:] == ["sampled completions, t = 6", "sampled completions, t = 9"]
+    parts = count_parameters(load_run(run)[0].model)
+    assert set(parts) == {"encoder", "decoder", "recurrence", "total"}
 
 
 def test_pictures_are_complete_files_with_nothing_beside_them(watched):

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, elbo_loss
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ParticleModel, VectorModel, elbo_loss
 from forbes.training import WorldModel
 
 # Lightning 2.6 uses what torch 2.13 deprecates, and has its opinion on loaders without workers.
@@ -140,6 +140,31 @@ def test_the_logged_bound_knows_no_free_nats_weights_or_closed_forms():
     assert logged[f"train/{BOUND}"] == pytest.approx(terms.elbo.mean().item())
     assert logged["train/kl"] == pytest.approx((terms.kl * terms.mask).sum().item() / BATCH)
     assert logged["train/reconstruction"] - logged["train/kl"] == pytest.approx(logged[f"train/{BOUND}"])
+
+
+@pytest.mark.parametrize(
+    ("options", "bound", "parts"),
+    [
+        ({"model": partial(ParticleModel, particles=3)}, "fivo[bernoulli,K=3]", {"reconstruction", "kl"}),
+        ({"model": partial(VectorModel, overshoot=2), "state_dim": 0}, "log_p[bernoulli]", {"overshoot"}),
+    ],
+    ids=["particles", "vector"],
+)
+def test_a_model_with_another_filter_is_trained_by_its_own_bound(options, bound, parts):
+    trainer, recorder = fit(make_world_model(**options), updates=1)
+
+    terms = terms_of_first_update(make_world_model(**options))
+
+    logged = recorder.rows[0]
+    assert logged["loss"] == pytest.approx(elbo_loss(terms).item())
+    assert logged[f"train/{bound}"] == pytest.approx(terms.elbo.mean().item())
+    of_train = {name.removeprefix("train/") for name in logged if name.startswith("train/")}
+    assert of_train == {bound, "gradient_norm"} | parts
+    assert {f"val/{name}" for name in {bound} | parts} <= set(trainer.callback_metrics)
+    if "overshoot" in parts:
+        assert logged["loss"] == pytest.approx(
+            -terms.elbo.sum().item() / terms.mask.sum().item() + logged["train/overshoot"]
+        )
 
 
 def test_the_weight_of_the_divergence_rises_to_one():

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from lightning import Trainer
+from lightning import LightningModule, Trainer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -15,6 +15,7 @@ from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import first_of_each_class
 from forbes.figures.style import BLACK, BLUE, GREY, ORANGE, PAGE, density_map, paper_style
+from forbes.models import StateSpaceModel
 from forbes.training.callbacks.picture import PictureCallback, to_device
 from forbes.training.world_model import WorldModel
 
@@ -29,7 +30,8 @@ class BeliefPlot(PictureCallback):
 
     Each panel shows density and samples; the prior's also shows, in the posterior's colour, where the posterior lies.
     With a state of two dimensions the density is exact. With more, samples are shown in the plane of the prior's
-    two leading principal components (with their share of its variance), and the density is a kernel estimate.
+    two leading principal components (with their share of its variance), and the density is a kernel estimate. Of a
+    `ParticleModel` it shows one trajectory of the proposal; a `VectorModel` has no state to plot.
 
     Args:
         digits: how many, the first of each class of the validation split.
@@ -47,9 +49,15 @@ class BeliefPlot(PictureCallback):
                 raise ForbesError(f"BeliefPlot: {name} is {value}, expected at least {least}.")
         self.digits, self.columns, self.samples = digits, columns, samples
 
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Refuse a model without a state, before hours are spent."""
+        if not isinstance(model := pl_module.model, StateSpaceModel):
+            raise ForbesError(f"BeliefPlot: {type(model).__name__} has no state to plot. Leave this callback out")
+
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """See `PictureCallback`."""
         model = module.model
+        assert isinstance(model, StateSpaceModel)
         index = first_of_each_class(data, "validation", self.digits)
         batch = to_device(data.sequences("validation", index), module)
         filtered = model.filter(model.embed(batch.observation), batch.action)

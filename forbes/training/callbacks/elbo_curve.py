@@ -15,11 +15,14 @@ from forbes.training.world_model import WorldModel
 
 __all__ = ["ElboCurve"]
 
+_TITLES = {"kl": "KL", "overshoot": "loss of the roll-out"}
+
 
 class ElboCurve(PictureCallback):
-    """Draws `figures/elbo.png`: ELBO, reconstruction and KL of both splits against updates, and the KL at each step.
+    """Draws `figures/elbo.png`: the bound and its parts of both splits against updates, and the KL at each step.
 
-    It reads `metrics.jsonl`, so a resumed run shows its whole life.
+    A model without a KL has the loss of its roll-out instead. It reads `metrics.jsonl`, so a resumed run shows its
+    whole life.
 
     Args:
         sequences: of the validation split, for the KL at each step.
@@ -35,15 +38,17 @@ class ElboCurve(PictureCallback):
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """See `PictureCallback`."""
         metrics = read_metrics(str(trainer.log_dir))
-        likelihood = module.model.likelihood.name
-        curves = {"ELBO": f"elbo[{likelihood},S=1]", "reconstruction": "reconstruction", "KL": "kl"}
+        names = [module.objective_name, *module.model.parts]
+        has_kl = "kl" in names
         with paper_style():
-            figure = Figure((PAGE, 4.2), layout="constrained")
-            axes = figure.subplots(2, 2).flat
-            for panel, (title, name) in zip(axes, curves.items(), strict=False):
+            figure = Figure((PAGE, 4.2 if has_kl else 2.3), layout="constrained")
+            axes = figure.subplots(2 if has_kl else 1, 2).flat
+            for panel, name in zip(axes, names, strict=False):
                 _draw_curves(panel, metrics, name)
-                panel.set(title=title, xlabel="updates", ylabel="nats per sequence")
-            _draw_steps(axes[3], *self._kl_per_step(module, data))
+                unit = "step" if name == "overshoot" else "sequence"
+                panel.set(title=_TITLES.get(name, name), xlabel="updates", ylabel=f"nats per {unit}")
+            if has_kl:
+                _draw_steps(axes[3], *self._kl_per_step(module, data))
             axes[0].legend()
         return figure
 

@@ -4,9 +4,10 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
-from forbes.models import StateSpaceModel
-
 __all__ = ["ParameterCount", "count_parameters"]
+
+_PARTS = {"transition": "recurrence", "gru": "recurrence", "nothing": "recurrence"}
+_PARTS |= {"prior_context": "prior", "posterior_context": "posterior"}  # the contexts belong to their belief
 
 
 class ParameterCount(Callback):
@@ -22,18 +23,11 @@ class ParameterCount(Callback):
             logger.log_metrics({"parameters": parts["total"]}, step=trainer.global_step - 1)
 
 
-def count_parameters(model: StateSpaceModel) -> dict[str, int]:
-    """Count by part; the contexts belong to their belief, and the total is of the whole model."""
-    parts: dict[str, list[nn.Module]] = {
-        "encoder": [model.encoder],
-        "recurrence": [model.transition, model.gru],
-        "prior": [model.prior_context, model.prior],
-        "posterior": [model.posterior_context, model.posterior],
-        "decoder": [model.decoder],
-        "total": [model],
-    }
-    return {part: sum(_size(module) for module in modules) for part, modules in parts.items()}
-
-
-def _size(module: nn.Module) -> int:
-    return sum(parameter.numel() for parameter in module.parameters())
+def count_parameters(model: nn.Module) -> dict[str, int]:
+    """Count by part, in the model's order, and the whole."""
+    parts: dict[str, int] = {}
+    for name, parameter in model.named_parameters():
+        part = name.partition(".")[0]
+        part = _PARTS.get(part, part)
+        parts[part] = parts.get(part, 0) + parameter.numel()
+    return parts | {"total": sum(parts.values())}

@@ -1,0 +1,228 @@
+r"""Sequential Monte Carlo: a belief of K weighted particles of (h, s), and the model trained by its bound.
+
+.. math::
+
+    (h, s)_t^k \sim q \text{ from } (h, s)_{t-1}^k, \qquad
+    w_t^k = \frac{p(o_t \mid h_t^k, s_t^k)\, p(s_t^k \mid h_t^k)}{q(s_t^k \mid h_t^k, e_t)} \\
+    \hat p_t = \sum_k W_{t-1}^k w_t^k, \qquad W_t^k = W_{t-1}^k w_t^k / \hat p_t, \qquad
+    \log p(o_{1:T}) \ge E \sum_t \log \hat p_t
+
+The product of all :math:`\hat p_t` is an unbiased estimate of p(o_1:T), so the mean of its logarithm is a bound
+(FIVO, Maddison et al., 2017, arXiv 1705.09279). Where the effective sample size falls below K / 2, particles are drawn
+anew, h and s jointly; `torch.where` decides, so shapes never depend on values.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Literal, NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+
+from forbes.beliefs import BeliefFamily
+from forbes.errors import ForbesError
+from forbes.models.base import Prediction, Seen, State
+from forbes.models.elbo import ElboTerms
+from forbes.models.likelihoods import Likelihood
+from forbes.models.networks import Decoder, Encoder
+from forbes.models.state_space import StateSpaceModel
+
+__all__ = ["ParticleModel", "Particles", "effective_sample_size", "run_particles", "soft", "systematic"]
+__all__ += ["systematic_resampling"]
+
+Resampling: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Normalised log-weights `(K, B)` to ancestors `(K, B)` and the log-weights of their children `(K, B)`."""
+
+_SOFTNESS = 0.5
+"""α of soft resampling: the share of ancestors that are drawn by weight."""
+
+
+class Particles(NamedTuple):
+    """The particles of one step, before they are drawn anew."""
+
+    hidden: Tensor
+    """h_t, `(K, B, H)`."""
+    state: Tensor
+    """s_t, `(K, B, D)`."""
+    log_before: Tensor
+    """log W_{t-1} of those they come from, `(K, B)`; after soft resampling not normalised."""
+    log_weight: Tensor
+    """log W_t, normalised, `(K, B)`."""
+    log_likelihood: Tensor
+    """log p(o_t | h_t, s_t) in nats, `(K, B)`."""
+    increment: Tensor
+    """What the step adds to the bound, log p̂_t in nats, `(B,)`."""
+
+
+def effective_sample_size(log_weight: Tensor) -> Tensor:
+    """Give 1 / Σ_k W_k² of normalised log-weights: `(K, B)` to `(B,)`, between 1 and K."""
+    return torch.exp(-torch.logsumexp(2 * log_weight, 0))
+
+
+def systematic_resampling(log_weight: Tensor, uniform: Tensor, number: int) -> Tensor:
+    r"""Choose N ancestors: child j comes from the first particle whose cumulative weight exceeds :math:`(j + u) / N`.
+
+    Each particle k is chosen :math:`\lfloor N W_k \rfloor` or :math:`\lceil N W_k \rceil` times, N W_k on average.
+
+    Args:
+        log_weight: normalised, `(K, B)`.
+        uniform: u in [0, 1), one for each sequence, `(B,)`.
+        number: N.
+
+    Returns:
+        Indices of the ancestors, `(N, B)`, int64.
+    """
+    cumulative = log_weight.exp().cumsum(0).T.contiguous()  # (B, K)
+    places = (torch.arange(number, device=uniform.device) + uniform[:, None]) / number  # (B, N)
+    chosen = torch.searchsorted(cumulative, places, right=True)  # (B, N)
+    return chosen.clamp(max=len(log_weight) - 1).T  # (N, B); rounding may leave the last sum below 1
+
+
+def systematic(log_weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw ancestors by weight; their children weigh the same, and nothing of the weights is left to a gradient."""
+    number, uniform = len(log_weight), torch.rand_like(log_weight[0])  # (B,)
+    equal = torch.full_like(log_weight, -math.log(number))
+    return systematic_resampling(log_weight, uniform, number), equal
+
+
+def soft(log_weight: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Draw ancestors by weight or evenly, and correct for it, so that gradients pass through the weights.
+
+    .. math:: a \sim V = \alpha W + (1 - \alpha) / K, \qquad W' = W_a / (K V_a)
+
+    PF-net and DPFRL (arXiv 1805.08975, 2002.09884) then normalise W'. Here it stays as it is, and :math:`\hat p_t`
+    unbiased.
+    """
+    number, uniform = len(log_weight), torch.rand_like(log_weight[0])  # (B,)
+    evenly = (1 - _SOFTNESS) / number
+    mixed = (_SOFTNESS * log_weight.exp() + evenly).log()  # (K, B)
+    ancestor = systematic_resampling(mixed, uniform, number)
+    return ancestor, (log_weight - mixed).gather(0, ancestor) - math.log(number)
+
+
+def run_particles(
+    model: StateSpaceModel,
+    seen: Seen,
+    number: int,
+    resampling: Resampling,
+    log_likelihood: Callable[[Tensor, Tensor], Tensor],
+    dtype: torch.dtype,
+) -> Iterator[Particles]:
+    """Filter a sequence with K particles and give them step by step, so that only one step need be held.
+
+    Args:
+        model: its posterior is the proposal.
+        seen: B sequences of T steps.
+        number: K.
+        resampling: `systematic` or `soft`.
+        log_likelihood: log p(o_t | features), of features `(K, B, H + D)` and o_t `(B, *O)`, to `(K, B)`.
+        dtype: of the weights.
+    """
+    sequences, steps = seen.embedding.shape[:2]
+    stay = torch.arange(number, device=seen.embedding.device)[:, None].expand(-1, sequences)  # (K, B)
+    log_before = torch.full(stay.shape, -math.log(number), dtype=dtype, device=stay.device)
+    step = model.bind(seen.embedding, seen.action, number)
+    carried = model.initial(number * sequences)
+    for t in range(steps):
+        moved = step(carried)
+        features = moved.features.view(*stay.shape, -1)  # (K, B, H + D)
+        reconstruction = log_likelihood(features, seen.target[:, t])
+        divergence = (moved.log_prob - model.prior_log_prob(moved)).view(stay.shape)  # (K, B)
+        joint = log_before + reconstruction - divergence
+        increment = joint.logsumexp(0)  # (B,)
+        log_weight = joint - increment
+        hidden, state = (values.view(*stay.shape, -1) for values in (moved.hidden, moved.state))  # (K, B, ...)
+        yield Particles(hidden, state, log_before, log_weight, reconstruction, increment)
+        again = effective_sample_size(log_weight) < number / 2  # (B,)
+        ancestor, log_child = resampling(log_weight)
+        carried = _choose(hidden, state, torch.where(again, ancestor, stay))
+        log_before = torch.where(again, log_child, log_weight)
+
+
+def _choose(hidden: Tensor, state: Tensor, index: Tensor) -> State:
+    """Take particles `(K, B, ...)` by their index within each sequence, `(N, B)`: `(N B, ...)`; h and s go together."""
+    sequences = index.shape[1]
+    row = (index * sequences + torch.arange(sequences, device=index.device)).flatten()  # (N B,)
+    return State(hidden.flatten(0, 1)[row], state.flatten(0, 1)[row])  # (N B, ...)
+
+
+class ParticleModel(StateSpaceModel):
+    """An RSSM whose belief is K weighted particles, trained by their bound (DVRL, Igl et al., 2018, arXiv 1806.02426).
+
+    With K = 1 it is the RSSM itself. DVRL draws particles anew at every step; here only those do whose effective sample
+    size is below K / 2, since each draw costs variance. The gradient leaves out the choice of ancestors, as there.
+
+    Args:
+        belief: and all others up to `prior`, as for `StateSpaceModel`.
+        particles: K.
+        resampling: "systematic"; or "soft", which lets gradients pass through the weights of those drawn anew.
+    """
+
+    def __init__(
+        self,
+        belief: BeliefFamily,
+        encoder: Encoder,
+        decoder: Decoder,
+        likelihood: Likelihood,
+        action_dim: int,
+        state_dim: int,
+        hidden_dim: int,
+        mlp_dim: int,
+        mlp_layers: int,
+        prior: BeliefFamily | None = None,
+        particles: int = 8,
+        resampling: Literal["systematic", "soft"] = "systematic",
+    ) -> None:
+        sizes = (action_dim, state_dim, hidden_dim, mlp_dim, mlp_layers)
+        super().__init__(belief, encoder, decoder, likelihood, *sizes, prior)
+        if particles < 1:
+            raise ForbesError(f"ParticleModel: particles is {particles}, expected at least 1")
+        self.particles = particles
+        self.resampling: Resampling = {"systematic": systematic, "soft": soft}[resampling]
+
+    @property
+    def bound_name(self) -> str:
+        """See `BeliefModel.bound_name`."""
+        return f"fivo[{self.likelihood.name},K={self.particles}]"
+
+    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
+        r"""Estimate the bound with K particles; arguments as in `SequenceBatch`.
+
+        The reconstruction is the weighted mean :math:`\sum_k W_t^k \log p(o_t \mid h_t^k, s_t^k)`, the KL what it
+        exceeds :math:`\log \hat p_t` by.
+        """
+        steps = list(self._run(self.see(observation, action)))
+        increment = torch.stack([step.increment for step in steps], 1)  # (B, T)
+        weighted = [(step.log_weight.exp() * step.log_likelihood).sum(0) for step in steps]
+        reconstruction = torch.stack(weighted, 1)  # (B, T)
+        return ElboTerms(reconstruction, kl=reconstruction - increment, analytic_kl=None, mask=mask)
+
+    def beliefs(self, seen: Seen, samples: int) -> State:
+        """See `BeliefModel.beliefs`: a systematic sample of one weighted set; particles may come up several times."""
+        last = deque(self._run(seen), maxlen=1)[0]
+        uniform = torch.rand_like(last.log_weight[0])  # (B,)
+        return _choose(last.hidden, last.state, systematic_resampling(last.log_weight, uniform, samples))
+
+    def predictions(self, seen: Seen) -> Prediction:
+        """See `BeliefModel.predictions`: each particle draws s_t from the prior."""
+        features, log_weight = [], []
+        for step in self._run(seen):
+            state, _ = self.prior.rsample(self.prior_context(step.hidden))  # (K, B, D)
+            features.append(torch.cat((step.hidden, state), -1))  # (K, B, H + D)
+            log_weight.append(step.log_before.log_softmax(0))
+        return Prediction(torch.stack(features, 2), torch.stack(log_weight, 2))  # (K, B, T, H + D), (K, B, T)
+
+    def draws(self, number: int) -> int:
+        """See `BeliefModel.draws`: a draw is a whole set."""
+        if number % self.particles:
+            raise ForbesError(
+                f"ParticleModel: {number} particles or futures, expected whole sets of {self.particles}, "
+                f"what a belief has. Choose a multiple of {self.particles}"
+            )
+        return number // self.particles
+
+    def _run(self, seen: Seen) -> Iterator[Particles]:
+        return run_particles(
+            self, seen, self.particles, self.resampling, self.log_likelihood, dtype=seen.embedding.dtype
+        )

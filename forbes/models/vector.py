@@ -1,0 +1,152 @@
+r"""A belief without a distribution: h_t itself, which predicts the next observation (SimCore, DRQN).
+
+.. math::
+
+    h_t = \mathrm{GRU}(h_{t-1}, \mathrm{MLP}(e_{t-1}, a_{t-1})), \quad (h_0, e_0) = (0, \bar e), \qquad
+    \log p(o_{1:T}) = \sum_t \log p(o_t \mid h_t)
+
+Nothing is drawn, so the likelihood is exact, by the chain rule, and no bound is needed. Rolled on without observations,
+the learned embedding :math:`\bar e` of "nothing seen" stands for those that are missing: the simulator of Gregor et
+al., 2019, arXiv 1906.09237. One-step predictions alone would never train it, so it is trained by overshooting.
+"""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from forbes.beliefs import BeliefFamily
+from forbes.deferred import Loop
+from forbes.errors import ForbesError
+from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
+from forbes.models.elbo import ElboTerms
+from forbes.models.likelihoods import Likelihood
+from forbes.models.networks import Decoder, Encoder, bind_gru
+
+__all__ = ["VectorModel"]
+
+
+class VectorModel(BeliefModel):
+    """A deterministic recurrent model; the pair it carries is (h_t, e_t), what it believed and what it then saw.
+
+    Args:
+        belief: not used, nor is `prior`: it has no density of a state.
+        encoder: o_t to e_t.
+        decoder: h to the likelihood's parameters; its input has `hidden_dim` dimensions.
+        likelihood: what the decoder's output means.
+        action_dim: A.
+        state_dim: 0, since it has no stochastic state.
+        hidden_dim: H of h.
+        mlp_dim: width of the perceptron before the GRU.
+        mlp_layers: layers of it.
+        prior: see `belief`.
+        overshoot: steps that are rolled on from one random step of each sequence in training.
+
+    Raises:
+        ForbesError: where `state_dim` is not 0, or `overshoot` below 1.
+    """
+
+    parts: ClassVar[tuple[str, ...]] = ("overshoot",)
+
+    def __init__(
+        self,
+        belief: BeliefFamily,
+        encoder: Encoder,
+        decoder: Decoder,
+        likelihood: Likelihood,
+        action_dim: int,
+        state_dim: int,
+        hidden_dim: int,
+        mlp_dim: int,
+        mlp_layers: int,
+        prior: BeliefFamily | None = None,
+        overshoot: int = 15,
+    ) -> None:
+        if state_dim != 0:
+            raise ForbesError(f"VectorModel: state_dim is {state_dim}, expected 0, it has no stochastic state")
+        if overshoot < 1:
+            raise ForbesError(f"VectorModel: overshoot is {overshoot}, expected at least 1")
+        input_dim = encoder.embedding_dim + action_dim
+        super().__init__(encoder, decoder, likelihood, input_dim, hidden_dim, mlp_dim, mlp_layers)
+        self.overshoot = overshoot
+        self.nothing = nn.Parameter(torch.zeros(encoder.embedding_dim))
+
+    @property
+    def bound_name(self) -> str:
+        """See `BeliefModel.bound_name`: it is the likelihood itself."""
+        return f"log_p[{self.likelihood.name}]"
+
+    def initial(self, batch: int) -> State:
+        """Give h_0 = 0, with nothing seen."""
+        return State(self.nothing.new_zeros(batch, self.hidden_dim), self.nothing.expand(batch, -1))
+
+    def filter(self, embedding: Tensor, action: Tensor, start: State | None = None) -> Tensor:
+        """Read a sequence.
+
+        Args:
+            embedding: e_t, `(B, T, E)`.
+            action: a_{t-1}, the action that led to o_t, `(B, T, A)`.
+            start: (h, e) to go on from; `initial` by default.
+
+        Returns:
+            h_t, which has seen o_{t-1} and a_{t-1}, but not o_t, `(B, T, H)`.
+        """
+        hidden, before = start or self.initial(len(embedding))
+        return self._run(hidden, torch.cat((before[:, None], embedding[:, :-1]), 1), action)
+
+    def imagine(self, start: State, action: Tensor) -> Rollout:
+        """See `BeliefModel.imagine`: one future, without randomness, in which nothing more is seen; s has D = 0."""
+        hidden, before = start
+        nothing = self.nothing.expand(*action.shape[:2], -1)[:, 1:]  # (B, T - 1, E)
+        rolled = self._run(hidden, torch.cat((before[:, None], nothing), 1), action)
+        return Rollout(rolled, rolled[..., :0], rolled.new_zeros(rolled.shape[:2]))
+
+    def beliefs(self, seen: Seen, samples: int) -> State:
+        """See `BeliefModel.beliefs`: N times the same, since it is certain."""
+        hidden = self.filter(seen.embedding, seen.action)
+        return State(hidden[:, -1].repeat(samples, 1), seen.embedding[:, -1].repeat(samples, 1))  # (N B, ...)
+
+    def predictions(self, seen: Seen) -> Prediction:
+        """See `BeliefModel.predictions`."""
+        hidden = self.filter(seen.embedding, seen.action)
+        return Prediction(hidden[None], hidden.new_zeros(1, *hidden.shape[:2]))  # (1, B, T, H), (1, B, T)
+
+    def draws(self, number: int) -> int:
+        """See `BeliefModel.draws`: one is as good as many."""
+        return 1
+
+    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
+        """Give log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the roll-out beside them."""
+        seen = self.see(observation, action)
+        hidden = self.filter(seen.embedding, action)
+        log_likelihood = self.log_likelihood(hidden, seen.target)  # (B, T)
+        auxiliary = {"overshoot": self._overshoot(hidden, seen, mask)}
+        return ElboTerms(log_likelihood, torch.zeros_like(log_likelihood), None, mask, auxiliary)
+
+    def _run(self, hidden: Tensor, embedding: Tensor, action: Tensor) -> Tensor:
+        """Give h after each (e, a), `(B, T, H)`: all inputs are known, so the loop holds the GRU only."""
+        moves = self.transition(torch.cat((embedding, action), -1))  # (B, T, M)
+        gru = bind_gru(self.gru, Loop(moves.shape[1], len(moves)))
+        steps: list[Tensor] = []
+        for move in moves.unbind(1):
+            hidden = gru(move, hidden)
+            steps.append(hidden)
+        return torch.stack(steps, 1)  # (B, T, H)
+
+    def _overshoot(self, hidden: Tensor, seen: Seen, mask: Tensor) -> Tensor:
+        r"""Give the loss of one roll-out in each sequence, from a step u among its own, in nats per step.
+
+        .. math:: -\frac1L \sum_{j=1}^{L} \log p(o_{u+j} \mid h_u, a_{u:u+j-1}), \qquad u \sim U\{1, \dots, T - 1\}
+
+        What would lie behind the end of a sequence does not count; index and shapes are the device's own affair.
+        """
+        batch, time = mask.shape
+        row = torch.arange(batch, device=mask.device)
+        start = (torch.rand(batch, device=mask.device) * (mask.sum(1) - 1)).long()  # (B,), u counted from 0
+        index = start[:, None] + torch.arange(1, self.overshoot + 1, device=mask.device)  # (B, L)
+        rows, inside = row[:, None], index.clamp(max=time - 1)
+        counts = mask[rows, inside] & (index < time)  # (B, L)
+        begin = State(hidden[row, start], self.nothing.expand(batch, -1))
+        features = self.imagine(begin, seen.action[rows, inside]).features  # (B, L, H)
+        log_likelihood = self.log_likelihood(features, seen.target[rows, inside])
+        return -(log_likelihood * counts).sum() / counts.sum().clamp(min=1)

@@ -1,0 +1,226 @@
+"""What every model promises, whatever its filter. A new one is one line in MODELS of `small_models.py`."""
+
+import pytest
+import torch
+from small_models import ACTION, BATCH, HIDDEN, MODELS, SHAPE, TIME, make_model, random_model, random_state, sequences
+
+from forbes.models import Seen, State, elbo_loss
+
+T = 3  # a step in the middle, counted from 0
+
+
+@pytest.fixture(params=MODELS, name="kind")
+def kind_fixture(request):
+    return request.param
+
+
+def seeded(function, *arguments, seed=0):
+    torch.manual_seed(seed)
+    with torch.no_grad():
+        return function(*arguments)
+
+
+def changed(observation, steps):
+    """The same sequences with other frames at some steps."""
+    other = observation.clone()
+    other[:, steps] = 1 - other[:, steps]
+    return other
+
+
+def cut(seen, steps):
+    return Seen(*(values[:, :steps] for values in seen))
+
+
+def without_gradient(model):
+    return [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
+
+
+def test_a_prediction_has_seen_what_was_before_it_and_nothing_else(kind):
+    model, (observation, action, _) = random_model(kind), sequences()
+    steered = action.clone()
+    steered[:, T] += 1
+
+    first, of_frame, of_action = (
+        seeded(model.predictions, model.see(*inputs))
+        for inputs in [(observation, action), (changed(observation, T), action), (observation, steered)]
+    )
+
+    for kept, lost, other in [(T + 1, T + 1, of_frame), (T, T, of_action)]:
+        torch.testing.assert_close(other.features[:, :, :kept], first.features[:, :, :kept], rtol=0, atol=0)
+        torch.testing.assert_close(other.log_weight[:, :, :kept], first.log_weight[:, :, :kept], rtol=0, atol=0)
+        assert (other.features[:, :, lost] != first.features[:, :, lost]).any(-1).all()
+
+
+def test_the_particles_of_a_prediction_weigh_one_together(kind):
+    model, (observation, action, _) = random_model(kind), sequences()
+
+    features, log_weight = seeded(model.predictions, model.see(observation, action))
+
+    assert features.shape[:3] == log_weight.shape == (model.particles, BATCH, TIME)
+    torch.testing.assert_close(log_weight.exp().sum(0), torch.ones(BATCH, TIME, dtype=torch.float64))
+
+
+def test_the_bound_of_a_prefix_is_the_prefix_of_the_bound(kind):
+    """The noise of a step does not depend on how many steps follow."""
+    model, batch = random_model(kind), sequences()
+
+    whole = seeded(model.elbo, *batch)
+    prefix = seeded(model.elbo, *(values[:, :T] for values in batch))
+
+    torch.testing.assert_close(prefix.reconstruction, whole.reconstruction[:, :T])
+    torch.testing.assert_close(prefix.kl, whole.kl[:, :T], rtol=1e-6, atol=1e-6)  # decoded in float32
+
+
+def test_a_belief_depends_on_all_that_was_seen_and_nothing_more(kind):
+    model, (observation, action, _) = random_model(kind), sequences()
+    belief = seeded(model.beliefs, cut(model.see(observation, action), T), 4)
+
+    for step in range(TIME):
+        other = seeded(model.beliefs, cut(model.see(changed(observation, step), action), T), 4)
+        same = all(map(torch.equal, belief, other))
+        assert same == (step >= T)
+
+
+def test_beliefs_keep_the_sequence_they_belong_to(kind):
+    """Draws are sample-major: with all sequences the same but one, its rows are the ones that differ."""
+    model, (observation, action, _) = random_model(kind), sequences()
+    observation[:], action[:] = observation[:1].clone(), action[:1].clone()
+    seen = model.see(observation, action)
+    observation[2] = 1 - observation[2]
+    others = model.see(observation, action)
+
+    belief, other = (seeded(model.beliefs, each, 4) for each in (seen, others))
+
+    assert len(belief.hidden) == len(belief.state) == 4 * BATCH
+    differs = (belief.hidden != other.hidden).any(-1).view(4, BATCH)
+    assert differs.tolist() == [[False, False, True, False, False]] * 4
+
+
+def test_beliefs_of_a_model_with_a_state_differ(kind):
+    model, (observation, action, _) = random_model(kind), sequences()
+
+    belief = seeded(model.beliefs, model.see(observation, action), 3 * model.particles)
+
+    if kind == "vector":
+        assert len(belief.state.unique(dim=0)) == BATCH
+    else:
+        assert len(belief.state.unique(dim=0)) > 2 * BATCH
+
+
+def test_imagination_keeps_its_rows_apart(kind, same_noise):
+    model, (_, action, _) = random_model(kind), sequences()
+    start = random_state(model)
+
+    rollout = model.imagine(start, action)
+    alone = model.imagine(State(*(x[2:3] for x in start)), action[2:3])
+
+    assert rollout.features.shape[:2] == (BATCH, TIME)
+    for of_row, of_batch in zip(alone, rollout, strict=True):
+        torch.testing.assert_close(of_row, of_batch[2:3])
+
+
+def test_a_batch_of_one_equals_that_row_of_a_batch(kind, same_noise):
+    model, (observation, action, mask) = random_model(kind), sequences()
+
+    batch = model.elbo(observation, action, mask)
+    row = model.elbo(observation[2:3], action[2:3], mask[2:3])
+
+    torch.testing.assert_close(row.reconstruction, batch.reconstruction[2:3], rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(row.kl, batch.kl[2:3], rtol=1e-6, atol=1e-6)
+
+
+def test_gradients_reach_every_parameter(kind):
+    model = random_model(kind)
+
+    elbo_loss(model.elbo(*sequences())).backward()
+
+    assert without_gradient(model) == []
+
+
+def test_gradients_of_an_untrained_model_reach_every_parameter_at_the_second_update(kind):
+    """The flow's last layers start at zero and block those before them, once."""
+    model = make_model(kind)
+    optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
+
+    for _ in range(2):
+        optimizer.zero_grad()
+        elbo_loss(model.elbo(*sequences())).backward()
+        optimizer.step()
+
+    assert without_gradient(model) == []
+
+
+def test_padding_changes_neither_loss_nor_gradients(kind):
+    model, (observation, action, mask) = random_model(kind), sequences()
+    mask[0, 2:] = mask[1, 1:] = mask[3, 5:] = False
+    noisy_observation = torch.where(mask[..., None, None, None], observation, 1 - observation)
+    noisy_action = torch.where(mask[..., None], action, 100.0)
+    results = []
+
+    for inputs in [(observation, action), (noisy_observation, noisy_action)]:
+        torch.manual_seed(0)
+        loss = elbo_loss(model.elbo(*inputs, mask), free_nats=0.1, free_nats_per="element")
+        results.append((loss, *torch.autograd.grad(loss, list(model.parameters()))))
+
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=0)
+
+
+def test_cutting_padding_off_changes_nothing(kind):
+    model, (observation, action, mask) = random_model(kind), sequences()
+    mask[:, 4:] = False
+
+    padded = seeded(model.elbo, observation, action, mask)
+    shorter = seeded(model.elbo, observation[:, :4], action[:, :4], mask[:, :4])
+
+    torch.testing.assert_close(elbo_loss(padded), elbo_loss(shorter))
+
+
+def test_a_process_without_actions_needs_no_dummy(kind):
+    model, (observation, _, mask) = make_model(kind, action_dim=0), sequences()
+    no_action = torch.zeros(BATCH, TIME, 0, dtype=torch.float64)
+
+    assert model.elbo(observation, no_action, mask).elbo.isfinite().all()
+    assert model.imagine(model.initial(BATCH), no_action).hidden.shape == (BATCH, TIME, HIDDEN)
+
+
+def test_decoding_keeps_the_leading_dimensions(kind):
+    model = random_model(kind)
+    features = model.imagine(random_state(model), torch.zeros(BATCH, TIME, ACTION, dtype=torch.float64)).features
+
+    output = model.decode(features)
+
+    assert output.shape == (BATCH, TIME, *SHAPE)
+    torch.testing.assert_close(output[1, 2], model.decoder(features[1, 2:3])[0])
+
+
+def test_a_saved_and_loaded_model_gives_identical_outputs(kind, tmp_path):
+    model, other, batch = random_model(kind, seed=0), random_model(kind, seed=1), sequences()
+    torch.save(model.state_dict(), tmp_path / "model.pt")
+    other.load_state_dict(torch.load(tmp_path / "model.pt", weights_only=True))
+    results = []
+
+    for each in (model, other):
+        terms = seeded(each.elbo, *batch)
+        results.append((terms.reconstruction, terms.kl, *seeded(each.imagine, each.initial(BATCH), batch[1])))
+
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=0)
+
+
+# The soft particles have a flow, whose time would be spent for what the others show.
+@pytest.mark.parametrize("kind", [kind for kind in MODELS if kind != "soft particles"])
+def test_overfits_one_batch(kind):
+    """A random pixel costs 0.69 nats until it is remembered, then what it takes to say which of the five sequences."""
+    model, batch = make_model(kind, width=64), sequences()
+    optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
+    torch.manual_seed(0)
+
+    bounds = []
+    for _ in range(300):
+        terms = model.elbo(*batch)
+        optimizer.zero_grad()
+        elbo_loss(terms).backward()
+        optimizer.step()
+        bounds.append(terms.elbo.mean().item() / TIME)
+
+    assert bounds[0] < -20
+    assert sum(bounds[-20:]) / 20 > bounds[0] / 3
