@@ -33,6 +33,13 @@ class Echo(Environment):
         return {"task": "Echo", "torch": "torch" in sys.modules, "process": os.getpid()}
 
 
+class Parrot(Echo):
+    """An echo that says of itself what stays the same, so that its episodes may be stored together."""
+
+    def describe(self):
+        return {"task": "Parrot", "steps": self.steps}
+
+
 class Troubled(Echo):
     """An echo that goes wrong at its third step, `times` times in all; `ledger` is a file that counts them."""
 

@@ -60,10 +60,9 @@ class Experience(SequenceSource):
         self._look()
 
     def close(self) -> None:
-        """Leave the folder and end the environment; to be asked for its numbers is to start it anew."""
+        """Leave the folder and end the environment; what is known of the episodes stays known."""
         if self._writer is not None:
             self._writer.__exit__()
-            self._writer = None
         if "environment" in self.__dict__:
             self.environment.close()
             del self.environment

@@ -73,7 +73,9 @@ class PlainProgress(ProgressBar):
 
 
 def _objectives(trainer: Trainer, module: LightningModule) -> dict[str, float]:
-    """Give the newest bound, or loss in nats per step, of each split."""
+    """Give the newest bound, or loss in nats per step, of each split, and the returns of an agent."""
     objective = getattr(module, "objective_name", "loss")  # a module of somebody else's may have none
     metrics = trainer.callback_metrics.items()
-    return {name: float(value) for name, value in metrics if name.endswith(f"/{objective}")}
+    return {
+        name: float(value) for name, value in metrics if name.endswith(f"/{objective}") or name.startswith("return/")
+    }

@@ -159,7 +159,7 @@ def test_a_model_with_another_filter_is_trained_by_its_own_bound(options, bound,
     assert logged["loss"] == pytest.approx(elbo_loss(terms).item())
     assert logged[f"train/{bound}"] == pytest.approx(terms.elbo.mean().item())
     of_train = {name.removeprefix("train/") for name in logged if name.startswith("train/")}
-    assert of_train == {bound, "gradient_norm"} | parts
+    assert of_train == {bound, "gradient_norm_model"} | parts
     assert {f"val/{name}" for name in {bound} | parts} <= set(trainer.callback_metrics)
     if "overshoot" in parts:
         assert logged["loss"] == pytest.approx(

@@ -54,8 +54,13 @@ class Collect(Callback):
             _experience(trainer).open(Path(trainer.default_root_dir) / "episodes")
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Close the store and the environment, however the training has ended."""
+        """Close the store and the environment."""
         _experience(trainer).close()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Close them where the training has been cut off, too."""
+        if isinstance(source := trainer.datamodule.source, Experience):  # type: ignore[attr-defined]
+            source.close()
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play what is missing."""

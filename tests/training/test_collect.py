@@ -1,0 +1,166 @@
+"""An agent that plays while it learns, through the command line: what is stored, counted, measured and resumed."""
+
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from forbes.cli import main
+from forbes.data.episode_store import EpisodeStore
+from forbes.training import ImaginationActorCritic
+from forbes.training.checkpoint import read_checkpoint
+from forbes.training.run_folder import RunFolder, read_metrics
+
+CONFIG = """\
+model:
+  class_path: {agent}
+  init_args:
+    belief: {{class_path: {belief}}}
+    encoder: {{class_path: MLPEncoder, init_args: {{width: 8, layers: 1}}}}
+    decoder: {{class_path: MLPDecoder, init_args: {{width: 8, layers: 1}}}}
+    likelihood: {{class_path: VectorNormal}}
+    state_dim: 2
+    hidden_dim: 6
+    mlp_dim: 8
+    mlp_layers: 1
+    control_dim: 8
+    {more}
+data:
+  class_path: SequenceDataModule
+  init_args:
+    source: {{class_path: Experience, init_args: {{task: Parrot, options: {{steps: 8}}}}}}
+    batch_size: 3
+    length: 5
+    updates_per_epoch: 4
+trainer:
+  max_epochs: 3
+  limit_val_batches: 0
+  log_every_n_steps: 1
+  callbacks:
+    - {{class_path: Collect, init_args: {{seed_episodes: 2, evaluate_every: 2, evaluation_episodes: 2}}}}
+"""
+AGENTS = {
+    "forbes": ("ImaginationActorCritic", "FlowBelief", "horizon: 3"),
+    "dreamer": ("ImaginationActorCritic", "GaussianBelief", "{horizon: 3, trajectories: 1}"),
+    "planet": ("PlanningAgent", "GaussianBelief", "horizon: 2"),
+}
+
+
+def write_config(folder, kind="forbes"):
+    agent, belief, more = AGENTS[kind]
+    path = folder / f"{kind}.yaml"
+    text = CONFIG.format(agent=agent, belief=belief, more=more.strip("{}").replace(", ", "\n    "))
+    if kind == "planet":
+        text = text.replace("    horizon: 2", "    horizon: 2\n    candidates: 20\n    best: 5\n    iterations: 2")
+    path.write_text(text)
+    return path
+
+
+def fit(*arguments):
+    return main(["--allow-module", "toy_environments", "fit", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("agent")
+    assert fit("--config", write_config(folder), "--run_dir", folder / "run") == 0
+    return folder / "run"
+
+
+def test_there_is_one_episode_before_each_epoch_and_the_seed_episodes_before_the_first(run):
+    records = EpisodeStore(run / "episodes").records.values()
+
+    assert [record.policy for record in records] == ["random"] * 2 + ["ImaginationActorCritic"] * 2
+    assert len({record.seed for record in records}) == 4
+
+
+def test_env_steps_agent_steps_and_updates_are_counted_apart(run):
+    """An episode of the parrot has 8 steps of 3 frames each."""
+    metrics = read_metrics(run)
+
+    steps = metrics["env_steps"].dropna()
+    assert steps.tolist() == [2 * 24, 3 * 24, 4 * 24]
+    assert metrics["agent_steps"].dropna().tolist() == [16, 24, 32]
+    assert steps.index.tolist() == [4, 8, 12]
+
+
+def test_the_returns_are_those_of_the_episodes(run):
+    metrics, records = read_metrics(run), EpisodeStore(run / "episodes").records
+
+    exploring = metrics["return/exploring"].dropna()
+    np.testing.assert_allclose(exploring, [records[2].total_reward, records[3].total_reward], rtol=1e-6)
+    assert metrics["return/acting"].notna().sum() == 2  # after epochs 2 and 3, the last
+
+
+@pytest.mark.parametrize("kind", ["dreamer", "planet"])
+def test_every_agent_trains(kind, tmp_path):
+    assert fit("--config", write_config(tmp_path, kind), "--run_dir", tmp_path / "run") == 0
+
+    assert len(EpisodeStore(tmp_path / "run" / "episodes").records) == 4
+    assert torch.isfinite(torch.tensor(read_metrics(tmp_path / "run")["train/reward"].dropna().values)).all()
+
+
+class Killed(BaseException):
+    """What the test kills a training with."""
+
+
+@pytest.mark.parametrize("update", [4, 6, 10])
+def test_a_killed_run_goes_on_to_the_same_numbers_and_the_same_episodes(run, tmp_path, monkeypatch, update):
+    """Killed after the first update of an epoch or in its midst: later episodes are set aside and played anew."""
+
+    def kill(self, loss):
+        if self.global_step == update:
+            raise Killed
+
+    other = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(ImaginationActorCritic, "on_before_backward", kill)
+        with pytest.raises(Killed):
+            fit("--config", write_config(tmp_path), "--run_dir", other)
+    assert fit("--resume", other) == 0
+
+    pd.testing.assert_frame_equal(read_metrics(other), read_metrics(run), check_exact=True)
+    state, expected = (read_checkpoint(RunFolder(path).checkpoint)["state_dict"] for path in (other, run))
+    torch.testing.assert_close(state, expected, rtol=0, atol=0)
+    stores = [EpisodeStore(path / "episodes") for path in (other, run)]
+    for number in range(4):
+        for ours, theirs in zip(*(store.episode(number)[:3] for store in stores), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    assert any((other / "episodes" / "set_aside").iterdir())
+
+
+def test_a_finished_run_can_be_made_longer(run, tmp_path):
+    """Two epochs and one more are three."""
+    other = tmp_path / "run"
+    assert fit("--config", write_config(tmp_path), "--run_dir", other, "--trainer.max_epochs", 2) == 0
+    shutil.copytree(other, moved := tmp_path / "moved")
+
+    assert fit("--resume", moved, "--trainer.max_epochs", 3) == 0
+
+    state, expected = (read_checkpoint(RunFolder(path).checkpoint)["state_dict"] for path in (moved, run))
+    torch.testing.assert_close(state, expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("Parrot", "Parot"), "Parot: no such task. Did you mean Parrot?"),
+        (("steps: 8", "length: 8"), "Parrot: its environment has no option length"),
+        (("seed_episodes: 2", "seed_episodes: 0"), "Collect: seed_episodes is 0, expected at least 1"),
+        (("class_path: ImaginationActorCritic", "class_path: WorldModel"), "Collect: found a WorldModel on Experience"),
+        (("horizon: 3", "model: VectorModel"), "its model is a VectorModel, expected a StateSpaceModel"),
+    ],
+)
+def test_refuses_what_cannot_be(tmp_path, capsys, change, message):
+    config = write_config(tmp_path)
+    text = config.read_text().replace(*change)
+    if "WorldModel" in change[1]:
+        text = text.replace("    horizon: 3\n", "").replace("    control_dim: 8\n", "")
+    if "VectorModel" in change[1]:
+        text = text.replace("state_dim: 2", "state_dim: 0")
+    config.write_text(text)
+
+    assert fit("--config", config, "--run_dir", tmp_path / "run") == 2
+    assert message in capsys.readouterr().err
