@@ -18,6 +18,7 @@ from rich.progress import Progress
 from forbes.arguments import ArgumentParser, positive
 from forbes.data import SequenceBatch, Simulated, Split
 from forbes.errors import ForbesError
+from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.measured import Measured, note, pair
 from forbes.evaluation.record import describe, read_record, write_record
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, split_batches
@@ -35,6 +36,7 @@ Measure trained models by bounds and proper scores, and compare them on the same
 
   forbes evaluate runs/compare/forbes-0 runs/compare/rssm-0
   forbes evaluate runs/compare/forbes-0 --scores elbo pll --digits 200
+  forbes evaluate runs/agent/forbes-0 runs/agent/dreamer-0 --episodes 20
 
 Nats per sequence of observations, fully normalised, without free nats; the KL is the Monte-Carlo estimate for every
 family; mean and standard error over sequences. An ELBO alone does not tell a good belief: it prefers one that is too
@@ -53,6 +55,8 @@ pll, fivo and open-loop take the first {_SUBSET} sequences, and their names say 
 evaluation.npz with each sequence's scores, into each run folder. Interrupted, the same command goes on where it
 stopped.
 
+Agents play --episodes without exploration, the same ones for all; their score is the return.
+
 On digit strokes and one core, elbo takes some 4 minutes a run, pll 5, fivo 3, and open-loop 20, in proportion to
 --futures and --digits."""
 
@@ -70,7 +74,10 @@ class _Job(NamedTuple):
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = _parser().parse_args(argv)
-    measured = evaluate(args.runs, args, shlex.join(["forbes", "evaluate", *argv]))
+    command = shlex.join(["forbes", "evaluate", *argv])
+    if is_agent(args.runs[0]):
+        return evaluate_agents(args.runs, args.episodes, args.seed, _device(args.device), command)
+    measured = evaluate(args.runs, args, command)
     print_runs(measured)
     if len(measured) > 1:
         print_pairs(pair(measured))
@@ -124,6 +131,7 @@ def wanted_metrics(paths: Sequence[str], args: Any) -> list[dict[str, bool]]:
 def _parser() -> ArgumentParser:
     parser = ArgumentParser("forbes evaluate", _DESCRIPTION)
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made")
+    parser.add_argument("--episodes", type=positive, default=10, help="that an agent plays (default: 10)")
     add_score_options(parser)
     return parser
 

@@ -1,0 +1,133 @@
+"""What agents earn: whole episodes without exploration, each agent in the same ones."""
+
+import itertools
+import sys
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from typing import Any, NamedTuple
+
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from torch import Tensor
+
+from forbes.control.agent import Agent
+from forbes.data import Experience
+from forbes.data.collection import describe_environment, play
+from forbes.errors import ForbesError
+from forbes.evaluation.estimates import Estimate, bootstrap_interval
+from forbes.evaluation.record import write_record
+from forbes.seeding import derive_seed
+from forbes.training.acting import ActingModel
+from forbes.training.loading import load_run
+from forbes.training.provenance import commit
+from forbes.training.run_folder import RunFolder
+
+__all__ = ["evaluate_agents", "is_agent"]
+
+
+class _Played(NamedTuple):
+    """A run and the episodes it was measured in."""
+
+    run: str
+    agent: ActingModel
+    returns: Tensor
+    """Undiscounted, `(E,)`, float64."""
+    environment: dict[str, Any]
+
+
+def is_agent(run: str) -> bool:
+    """Tell whether a run folder holds an agent, which is measured by what it earns."""
+    module, data = load_run(run)
+    if isinstance(data.source, Experience):
+        data.source.close()
+    return isinstance(module, ActingModel)
+
+
+def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, command: str) -> None:
+    """Let every agent play the same episodes, record their returns in the run folders, and print a table.
+
+    Episode k of every run is reset with the same seed, none of which was used in a training. The action is the policy's
+    mode, or the plan, without noise.
+
+    Args:
+        runs: run folders.
+        episodes: E, at least 2.
+        seed: of the episodes.
+        device: of the models.
+        command: for the record.
+
+    Raises:
+        ForbesError: where a run is not an agent's, or its task is another than the first's.
+    """
+    if episodes < 2:
+        raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
+    played = []
+    for run in runs:
+        played.append(_play(run, episodes, seed, device))
+        _require_same_task(played[0], played[-1])
+    name = f"return[episodes={episodes}]"
+    for one in played:
+        entry = {
+            **Estimate.of(one.returns)._asdict(),
+            "interval_95": bootstrap_interval(one.returns),
+            "returns": one.returns.tolist(),
+            "environment": one.environment,
+            "checkpoint": RunFolder(one.run).checkpoint_sha256(),
+            "command": command,
+            "commit": commit(),
+            "seed": seed,
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+        write_record(one.run, {name: entry}, {name: one.returns})
+    _print(played, name)
+
+
+def _play(run: str, episodes: int, seed: int, device: str) -> _Played:
+    module, data = load_run(run)
+    if not isinstance(module, ActingModel) or not isinstance(data.source, Experience):
+        raise ForbesError(f"{run}: not the run of an agent, expected one as the others are. Measure it by itself")
+    module.to(device)
+    choose, returns = module.choose(exploring=False), []
+    environment = data.source.environment
+    try:
+        for number in _counted(run, episodes):
+            chance = derive_seed(seed, "test episode", number) % 2**32
+            episode = play(environment, Agent(module.model, choose, chance), chance)
+            returns.append(episode.reward.sum(dtype="float64"))
+        return _Played(run, module, torch.tensor(returns, dtype=torch.float64), describe_environment(environment))
+    finally:
+        data.source.close()
+
+
+def _counted(run: str, episodes: int) -> Iterator[int]:
+    """Count, and say how far it is."""
+    for number in range(episodes):
+        yield number
+        print(f"{run}: {number + 1}/{episodes} episodes", file=sys.stderr, flush=True)
+
+
+def _require_same_task(first: _Played, other: _Played) -> None:
+    ours, theirs = ({k: v for k, v in one.environment.items() if k != "made_by"} for one in (first, other))
+    if ours != theirs:
+        raise ForbesError(
+            f"{other.run}: its task is {theirs['task']} ({theirs}), that of {first.run} is {ours['task']} ({ours}), "
+            "expected the same. Compare agents of one task"
+        )
+
+
+def _print(played: Sequence[_Played], name: str) -> None:
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    table = Table(title=f"{name}: undiscounted, mean ± standard error over episodes; the same episodes for all")
+    for header in ("run", "agent", "parameters", "return", "lowest", "highest"):
+        table.add_column(header, overflow="fold", justify="left" if header in ("run", "agent") else "right")
+    for one in played:
+        size = sum(parameter.numel() for parameter in one.agent.parameters())
+        ends = (f"{end.item():.1f}" for end in (one.returns.min(), one.returns.max()))
+        kind = f"{type(one.agent).__name__}, {type(one.agent.model.posterior).__name__}"
+        table.add_row(escape(one.run), kind, f"{size:,}", str(Estimate.of(one.returns)), *ends)
+    console.print(table)
+    for first, second in itertools.combinations(played, 2):
+        difference = Estimate.of(first.returns - second.returns)
+        console.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")

@@ -1,0 +1,71 @@
+"""What `forbes evaluate` says of agents."""
+
+import shutil
+
+import numpy as np
+import pytest
+from small_agents import fit, forbes, write_config
+
+from forbes.control.agent import Agent
+from forbes.evaluation.record import read_arrays, read_record
+from forbes.seeding import derive_seed
+from forbes.training.loading import load_run
+
+NAME = "return[episodes=3]"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("agent")
+    assert fit("--config", write_config(folder), "--run_dir", folder / "run", "--trainer.max_epochs", 1) == 0
+    return folder / "run"
+
+
+def test_the_return_is_what_the_agent_earns_without_exploration(run, capsys):
+    """A parrot pays what it is told, so the return is the sum of the actions."""
+    assert forbes("evaluate", run, "--episodes", 3, "--seed", 5) == 0
+
+    module, data = load_run(run)
+    earned = []
+    for number in range(3):
+        seed = derive_seed(5, "test episode", number) % 2**32
+        agent = Agent(module.model, module.choose(exploring=False), seed)
+        actions, shown = [], [seed % 97, 0]
+        for step in range(8):
+            action = agent(np.array(shown, np.float32))
+            actions.append(action[0])
+            shown = [action[0], step + 1]
+        earned.append(sum(actions))
+    data.source.close()
+    entry = read_record(str(run))[NAME]
+    np.testing.assert_allclose(entry["returns"], earned, rtol=1e-5)
+    assert entry["mean"] == pytest.approx(np.mean(earned), rel=1e-5)
+    assert entry["standard_error"] == pytest.approx(np.std(earned, ddof=1) / np.sqrt(3), rel=1e-5)
+    np.testing.assert_array_equal(read_arrays(str(run))[NAME], entry["returns"])
+    assert entry["environment"]["task"] == "Parrot"
+    assert entry["command"].startswith("forbes evaluate")
+    assert "ImaginationActorCritic" in capsys.readouterr().out
+
+
+def test_every_agent_plays_the_same_episodes(run, tmp_path, capsys):
+    shutil.copytree(run, twin := tmp_path / "twin")
+
+    assert forbes("evaluate", run, twin, "--episodes", 3) == 0
+
+    assert "paired: 0.00 ± 0.00" in " ".join(capsys.readouterr().out.split())
+
+
+def test_refuses_what_cannot_be_compared(run, tiny_run, tmp_path, capsys):
+    shutil.copytree(run, other := tmp_path / "other")
+    (other / "evaluation.json").unlink(missing_ok=True)
+    config = other / "config.yaml"
+    config.write_text(config.read_text().replace("steps: 8", "steps: 9"))
+
+    for arguments, message in [
+        ((run, other), "its task is Parrot"),
+        ((run, tiny_run), "not the run of an agent"),
+        ((run, "--episodes", 1), "--episodes 1: a standard error needs at least 2"),
+    ]:
+        assert forbes("evaluate", *arguments) == 2
+        assert message in capsys.readouterr().err
+    assert not (other / "evaluation.json").exists()
