@@ -5,9 +5,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from forbes.envs.base import Environment, Step
-from forbes.pomdps import Process
+from forbes.errors import ForbesError
+from forbes.pomdps import CategoricalBelief, ExactBelief, GaussianMixtureBelief, Process
 from forbes.pomdps.base import require_positive
 from forbes.pomdps.hmm import FiniteProcess
 
@@ -23,16 +25,26 @@ class KnownProcess(Environment):
     c is `Process.action_scale`, so that an agent's actions fill [-1, 1]; those of finite processes are one-hot.
     `Process.exact_filter` of an episode takes its observations and c times its actions.
 
+    With `exact_belief` the agent is shown, in place of o_t, what determines the exact belief p(s_t | o_1:t, a_1:t-1):
+    probabilities of finite states, or weights, means and standard deviations of a Gaussian mixture. What it earns then
+    is what perfect filtering is worth to the same agent.
+
     Args:
         process: one that has rewards, e.g. `MountainHike`.
         time_limit: steps after which an episode is truncated.
+        exact_belief: show the exact belief.
+
+    Raises:
+        ForbesError: where the exact belief has no such numbers.
     """
 
-    def __init__(self, process: Process, time_limit: int = 75) -> None:
+    def __init__(self, process: Process, time_limit: int = 75, exact_belief: bool = False) -> None:
         require_positive("KnownProcess", time_limit=time_limit)
-        self.process, self.time_limit = process, time_limit
+        self.process, self.time_limit, self.exact_belief = process, time_limit, exact_belief
         self.observation_shape, self.action_dim = (process.observation_dim,), process.action_dim
         self.discrete = isinstance(process, FiniteProcess)
+        if exact_belief:
+            self.observation_shape = self.reset(0).observation.shape
 
     def reset(self, seed: int) -> Step:
         """See `Environment.reset`."""
@@ -40,12 +52,15 @@ class KnownProcess(Environment):
         self._time = 0
         like = torch.zeros(1, self.process.action_dim, dtype=torch.float64)
         self._state = self.process.initial(like).sample(1, self._generator).view(1, -1)  # (1, D)
+        self._seen: list[Tensor] = []
+        self._taken = [like]
         return Step(self._observe())
 
     def step(self, action: NDArray[np.float32]) -> Step:
         """See `Environment.step`."""
         taken = self.process.action_scale * torch.from_numpy(action).double().unsqueeze(0)  # (1, A)
         before = self._state
+        self._taken.append(taken)
         self._state = self.process.transition(before, taken).sample(1, self._generator).squeeze(0)  # (1, D)
         self._time += 1
         reward = self.process.reward(before, taken, self._state).item()
@@ -54,10 +69,28 @@ class KnownProcess(Environment):
 
     def _observe(self) -> NDArray[np.float32]:
         seen = self.process.emission(self._state).sample(1, self._generator)  # (1, 1, O)
-        return seen.flatten().float().numpy()  # (O,)
+        if not self.exact_belief:
+            return seen.flatten().float().numpy()  # (O,)
+        self._seen.append(seen.squeeze(0))
+        history = (torch.stack(values, 1) for values in (self._seen, self._taken))  # (1, t, O), (1, t, A)
+        return _numbers(self.process.exact_filter(*history).belief).float().numpy()  # (O,)
 
     def describe(self) -> dict[str, Any]:
         """See `Environment.describe`: the process's numbers are those of its attributes."""
         plain = {name: value for name, value in vars(self.process).items() if isinstance(value, int | float | str)}
         made_by = {"torch": torch.__version__}
-        return {"task": type(self.process).__name__, "time_limit": self.time_limit, **plain, "made_by": made_by}
+        known = {"time_limit": self.time_limit, "exact_belief": self.exact_belief}
+        return {"task": type(self.process).__name__, **known, **plain, "made_by": made_by}
+
+
+def _numbers(belief: ExactBelief) -> Tensor:
+    """Give what determines the last of a sequence's beliefs, `(O,)`."""
+    if isinstance(belief, CategoricalBelief):
+        return belief.mean[0, -1]  # (S,)
+    if not isinstance(belief, GaussianMixtureBelief):
+        raise ForbesError(
+            f"exact_belief: a {type(belief).__name__} has too many numbers, expected finite states or Gaussians. "
+            "Leave it out"
+        )
+    std = belief.covariance[-1].diagonal().sqrt()  # (D,)
+    return torch.cat((belief.log_weight[0, -1].exp(), belief.component_mean[0, -1].flatten(), std))  # (K + K D + D,)

@@ -52,7 +52,7 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
     return partial(make, **options)
 
 
-def _open_process(task: str) -> Environment:
+def _open_process(task: str, exact_belief: bool = False) -> Environment:
     """Build a known process where it is used: tensors do not travel, and only here is torch imported."""
     from forbes import pomdps
     from forbes.envs.known_process import KnownProcess
@@ -63,7 +63,7 @@ def _open_process(task: str) -> Environment:
         "t_maze": pomdps.TMaze,
         "tiger": pomdps.Tiger,
     }
-    return KnownProcess(processes[task](), _HORIZONS[task])
+    return KnownProcess(processes[task](), _HORIZONS[task], exact_belief)
 
 
 def _descendants(kind: type) -> Iterator[type]:

@@ -127,3 +127,29 @@ def test_names_that_are_nearly_right_are_suggested():
         find_environment("mountain_hik")
     with pytest.raises(ForbesError, match=r"^tiger: its environment has no option camera\. Leave it out$"):
         find_environment("tiger", camera=1)
+
+
+@pytest.mark.parametrize("task", ["mountain_hike", "multi_start_hike", "t_maze", "tiger"])
+def test_with_the_exact_belief_an_episode_is_the_same_and_its_belief_is_shown(task):
+    """Beside the ordinary episode of the same seed and actions, whose observations are filtered at the end."""
+    plain, shown = find_environment(task)(), find_environment(task, exact_belief=True)()
+    process = plain.process
+
+    ordinary, believed = (play(environment, random_policy(environment, 3), 3) for environment in (plain, shown))
+
+    for name in ("action", "reward"):
+        np.testing.assert_array_equal(getattr(ordinary, name), getattr(believed, name))
+    # the ordinary episode's numbers are float32, those that were filtered float64
+    action = process.action_scale * torch.from_numpy(ordinary.action).double()
+    belief = process.exact_filter(torch.from_numpy(ordinary.observation).double()[None], action[None]).belief
+    if task in ("t_maze", "tiger"):
+        expected = belief.mean[0]
+    else:
+        std = belief.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        expected = torch.cat((belief.log_weight[0].exp(), belief.component_mean[0].flatten(1), std), 1)
+    np.testing.assert_allclose(believed.observation, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_refuses_to_show_a_belief_of_too_many_numbers():
+    with pytest.raises(ForbesError, match="exact_belief: a GridBelief has too many numbers"):
+        KnownProcess(MirrorSensor(), exact_belief=True)
