@@ -37,6 +37,11 @@ COMMANDS = {
     "calibrate": Command(
         "check a filter against its own model", "RUN -o figures", "forbes.figures.calibrate_command:main"
     ),
+    "completions": Command(
+        "tell how precise and diverse predicted digits are",
+        "RUN RUN -o figures",
+        "forbes.figures.completions_command:main",
+    ),
     "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.figures.commands:main"),
     "data": Command(
         "fetch, build, collect and look at data", "show strokes -o strokes.png", "forbes.data.commands:main"
@@ -117,7 +122,7 @@ def _help() -> str:
     """List the commands."""
     rows = []
     for name, command in COMMANDS.items():
-        rows += [f"  {name:<9} {command.summary}", f"            forbes {name} {command.example}".rstrip(), ""]
+        rows += [f"  {name:<11} {command.summary}", f"              forbes {name} {command.example}".rstrip(), ""]
     return HELP.format(commands="\n".join(rows))
 
 

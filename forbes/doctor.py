@@ -16,6 +16,7 @@ from rich.table import Column, Table
 import forbes
 from forbes.arguments import ArgumentParser
 from forbes.data.dejong import dejong_path
+from forbes.data.digit_classifiers import classifiers_path
 from forbes.data.strokes import bundled_path
 from forbes.envs.rendering import BACKENDS, probe_backend
 
@@ -101,6 +102,7 @@ def _data() -> Iterator[Finding]:
     yield Finding("configurations", str(shipped))
     for name, path, remedy, needed in (
         ("strokes, bundled", bundled_path(), "forbes data build-strokes --images DIR", True),
+        ("digit classifiers", classifiers_path(), "install forbes again, if you need forbes completions", False),
         ("strokes, de Jong", dejong_path(), "forbes data fetch strokes (optional: the paper's set)", False),
     ):
         found = path.is_file()

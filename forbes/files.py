@@ -1,16 +1,21 @@
-"""Files that a reader never sees half of, and folders that two processes never write to."""
+"""Files that no reader sees half of, folders that no two processes write to, arrays that are stored alike anywhere."""
 
 import fcntl
+import io
 import os
 import platform
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
 
-__all__ = ["fsync_folder", "locked", "replace_file"]
+__all__ = ["fsync_folder", "locked", "npz_bytes", "replace_file"]
 
 
 def replace_file(path: Path, content: bytes | memoryview) -> None:
@@ -65,3 +70,19 @@ def _replace_content(file: TextIO, content: str) -> None:
     file.truncate()
     file.write(content)
     file.flush()
+
+
+def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """Give the content of a compressed `.npz` file whose bytes depend on the arrays alone.
+
+    `numpy.savez_compressed` would stamp the members with the time of writing.
+    """
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, array in arrays.items():
+            member = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+            member.create_system = 3  # Unix, also where this runs on Windows
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
+            archive.writestr(member, buffer.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=9)
+    return content.getvalue()

@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.progress import track
 
+from forbes.data.classifier_training import classify, digits_of, quality, train_classifiers
 from forbes.data.dejong import dejong_path, verify_dejong
+from forbes.data.digit_classifiers import CLASSIFIERS_SHA256, classifiers_path, save_weights
 from forbes.data.episode_commands import add_episode_commands
 from forbes.data.fetch import fetch_dejong
 from forbes.data.pictures import save_picture
@@ -23,12 +26,13 @@ from forbes.data.stroke_file import SIDE, load_strokes, save_strokes
 from forbes.data.strokes import Strokes, bundled_path
 from forbes.errors import ForbesError
 
-__all__ = ["build_strokes", "compare_strokes", "fetch", "main", "show"]
+__all__ = ["build_classifiers", "build_strokes", "compare_strokes", "fetch", "main", "show"]
 
 Dataset = Literal["strokes"]
 Origin = Literal["bundled", "dejong"]
 
 _FRAMES = 6
+_PREFIXES = (5, 10, 15)  # points of the beginnings for which classifiers are measured
 
 
 def build_strokes(images: Path, output: Path | None = None) -> None:
@@ -48,6 +52,28 @@ def build_strokes(images: Path, output: Path | None = None) -> None:
     after = output.read_bytes()
     change = "unchanged" if after == before else "changed" if before else "new"
     print(f"{output}: {len(after)} bytes, sha256 {hashlib.sha256(after).hexdigest()}, {change}")
+
+
+def build_classifiers(output: Path | None = None) -> None:
+    """Train the digit classifiers on both sets of strokes, and say how good they are on test digits.
+
+    Args:
+        output: File to write, by default the bundled one.
+    """
+    torch.set_num_threads(1)  # the sums of several threads come in another order
+    output = output or classifiers_path()
+    sources = {origin: Strokes(origin) for origin in get_args(Origin)}
+    classifiers = train_classifiers(sources)
+    print(f"{'classifier':<16} {'strokes':<8} {'points':>6} {'digits':>6} {'accuracy':>8} {'nll':>6} {'ECE':>6}")
+    for origin, source in sources.items():
+        digits = digits_of(source, "test")
+        for name, points in (("finished", None), *((f"prefix-{origin}", count) for count in _PREFIXES)):
+            found = quality(*classify(classifiers[name], digits, points))
+            print(f"{name:<16} {origin:<8} {points or 'all':>6} {found.digits:>6} {found.accuracy:>8.4f} ", end="")
+            print(f"{found.nll:>6.3f} {found.calibration_error:>6.3f}")
+    sha256 = save_weights(output, classifiers)
+    change = "unchanged" if sha256 == CLASSIFIERS_SHA256 else "changed: put it into forbes/data/digit_classifiers.py"
+    print(f"{output}: {output.stat().st_size} bytes, weights of sha256 {sha256}, {change}")
 
 
 def fetch(dataset: Dataset, from_: Path | None = None) -> None:
@@ -162,6 +188,9 @@ def _parser() -> argparse.ArgumentParser:
     build = add("build-strokes", build_strokes, "build-strokes --images package/data")
     build.add_argument("--images", type=Path, required=True, help="folder with the four IDX files of MNIST, unpacked")
     build.add_argument("-o", "--output", type=Path, help="file to write, by default the bundled one")
+
+    train = add("build-classifiers", build_classifiers, "build-classifiers -o classifiers.npz")
+    train.add_argument("-o", "--output", type=Path, help="file to write, by default the bundled one")
 
     get = add("fetch", fetch, "fetch strokes --from sequences.tar.gz")
     get.add_argument("dataset", choices=get_args(Dataset))

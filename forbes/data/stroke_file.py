@@ -12,7 +12,6 @@ For each split ``S`` in ``train``, ``test``:
 
 import hashlib
 import io
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
+from forbes.files import npz_bytes, replace_file
 
 __all__ = ["SIDE", "StrokeArrays", "check_strokes", "load_strokes", "save_strokes", "sha256_of_arrays"]
 
@@ -125,25 +125,11 @@ def _find_problem(arrays: StrokeArrays) -> str | None:
 
 
 def save_strokes(path: Path, splits: Mapping[str, StrokeArrays]) -> None:
-    """Write a stroke file whose bytes depend on the arrays alone; a reader never sees half of it.
-
-    `numpy.savez_compressed` would stamp the members with the time of writing.
-    """
+    """Write a stroke file whose bytes depend on the arrays alone; a reader never sees half of it."""
     check_strokes(splits, path, "Nothing was written")
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
-        for split, arrays in splits.items():
-            for name, array in arrays._asdict().items():
-                member = zipfile.ZipInfo(f"{split}_{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-                member.create_system = 3  # Unix, also where this runs on Windows
-                buffer = io.BytesIO()
-                np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
-                archive.writestr(member, buffer.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=9)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    arrays = {f"{split}_{name}": array for split, arrays in splits.items() for name, array in arrays._asdict().items()}
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(content.getvalue())
-        temporary.replace(path)
+        replace_file(path, npz_bytes(arrays))
     except OSError as error:
         raise ForbesError(f"{path}: cannot be written ({error.strerror}). Choose another place.") from error
 

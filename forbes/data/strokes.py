@@ -111,6 +111,11 @@ class Strokes(SequenceSource):
         """Give the class of each digit of a split, int64 (N,)."""
         return torch.from_numpy(self._splits[split].labels).long()
 
+    def steps(self, split: Split) -> Tensor:
+        """Count the steps of each digit of a split until it is whole, int64 (N,)."""
+        points = self._tensors[split][1].diff()  # (N,)
+        return -(-points // self.points_per_step)
+
     def gather(self, split: Split, index: Tensor, length: int) -> StrokePoints:
         """Collect the paths of digits `index`, int64 (B,), cut or padded to `length` steps."""
         if length < 1:

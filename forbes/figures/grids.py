@@ -12,10 +12,12 @@ from torch import Tensor
 
 from forbes.figures.style import BLACK, GREY, PAGE, paper_style
 
-__all__ = ["Panel", "draw_panels", "seen_panel", "truth_panel"]
+__all__ = ["Bars", "Panel", "draw_panels", "seen_panel", "truth_panel"]
 
 _GAP = 2  # pixels between the frames of a panel
 _GAP_COLOUR = 0.86
+_BARS_COLUMNS = 3
+"""A row of bars is as wide as so many frames."""
 
 
 class Panel(NamedTuple):
@@ -28,6 +30,19 @@ class Panel(NamedTuple):
     """Of the ink, where the frames are grey."""
     labels: Sequence[str] = ()
     """One for each column, below it."""
+
+
+class Bars(NamedTuple):
+    """Probabilities as bars, a row beside each row of frames."""
+
+    title: str
+    shares: NDArray[np.float64]
+    """In [0, 1], rows × values: `(R, V)`."""
+    colour: str
+    behind: NDArray[np.float64] | None = None
+    """Others to compare with, `(R, V)`, drawn as a grey area."""
+    notes: Sequence[str] = ()
+    """One for each row, above its bars."""
 
 
 def truth_panel(observation: Tensor, times: Sequence[int]) -> Panel:
@@ -47,12 +62,13 @@ def _frames(observation: Tensor, times: Sequence[int]) -> Tensor:
     return grey[:, [time - 1 for time in times]]
 
 
-def draw_panels(panels: Sequence[Panel], width: float = PAGE) -> Figure:
-    """Draw panels of equal rows beside each other, all frames of the same size."""
+def draw_panels(panels: Sequence[Panel | Bars], width: float = PAGE) -> Figure:
+    """Draw panels of equal rows beside each other, all frames of the same size; the first one has frames."""
+    assert isinstance(panels[0], Panel)
     rows, height, wide = (panels[0].images.shape[d] for d in (0, 3, 4))
     margin, title, labels = 0.03, 0.24, 0.18  # inches: left and right, above, below
     space = 0.7  # between panels, in frames
-    columns = [panel.images.shape[1] for panel in panels]
+    columns = [panel.images.shape[1] if isinstance(panel, Panel) else _BARS_COLUMNS for panel in panels]
     cell = (width - 2 * margin) / (sum(columns) + space * (len(panels) - 1))  # inches
     tall = rows * cell * height / wide
     total = title + tall + labels
@@ -61,7 +77,10 @@ def draw_panels(panels: Sequence[Panel], width: float = PAGE) -> Figure:
         left = margin
         for panel, count in zip(panels, columns, strict=True):
             axes = figure.add_axes((left / width, labels / total, count * cell / width, tall / total))
-            _draw_panel(axes, panel)
+            if isinstance(panel, Panel):
+                _draw_panel(axes, panel)
+            else:
+                _draw_bars(axes, panel)
             left += (count + space) * cell
     return figure
 
@@ -73,6 +92,26 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set_xticks([width * k + width / 2 for k in range(len(panel.labels))], panel.labels, fontsize=6, color=GREY)
     axes.tick_params(length=0, pad=2)
     axes.set_yticks([])
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
+
+
+def _draw_bars(axes: Axes, bars: Bars) -> None:
+    """Draw row r between the heights R - r - 1 and R - r; a share of 1 leaves room for the note."""
+    rows, values = bars.shares.shape
+    edges, full = np.arange(values + 1) - 0.5, 0.62
+    for row in range(rows):
+        floor = rows - row - 1
+        axes.axhline(floor, color=GREY, lw=0.4)
+        if bars.behind is not None:
+            axes.stairs(floor + full * bars.behind[row], edges, baseline=floor, fill=True, color=GREY, alpha=0.4, lw=0)
+        axes.bar(np.arange(values), full * bars.shares[row], 0.6, bottom=floor, color=bars.colour)
+    for row, note in enumerate(bars.notes):
+        axes.text(values - 0.5, rows - row - 0.08, note, fontsize=5, color=GREY, ha="right", va="top")
+    axes.set(xlim=(-0.6, values - 0.4), ylim=(0, rows), yticks=[])
+    axes.set_title(bars.title, color=bars.colour, pad=4)
+    axes.set_xticks(range(values), [str(value) for value in range(values)], fontsize=5, color=GREY)
+    axes.tick_params(length=0, pad=2)
     axes.grid(False)
     axes.spines[:].set_visible(False)
 

@@ -7,9 +7,9 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
-from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
+from forbes.data import SequenceBatch, SequenceDataModule, Strokes
+from forbes.evaluation.neighbours import Beginnings, last_frame
 from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import COLUMN, paper_style, show_settled
@@ -91,20 +91,10 @@ def ambiguous_digits(data: SequenceDataModule, context: int, candidates: int = 5
     """
     source = data.source
     assert isinstance(source, Strokes)
-    train, labels = _blurred(data, "train", source.size("train"), context), source.labels("train")
-    test, own = _blurred(data, "test", min(candidates, source.size("test")), context), source.labels("test")
-    nearest = torch.cdist(test, train).topk(min(neighbours, len(train)), largest=False).indices  # (N, neighbours)
+    labels, own = source.labels("train"), source.labels("test")[:candidates]
+    test = data.sequences("test", torch.arange(len(own)), context).observation  # (N, T, C, H, W)
+    nearest = Beginnings(data, context, last_frame).nearest(test, neighbours)  # (N, neighbours)
     counts = torch.nn.functional.one_hot(labels[nearest], 10).sum(1).double()  # (N, 10)
     entropy = torch.special.entr(counts / counts.sum(1, keepdim=True)).sum(1)  # (N,)
-    own = own[: len(test)]
     chosen = [torch.where(own == label, entropy, -1).argsort(descending=True, stable=True)[0] for label in own.unique()]
     return torch.stack(chosen)
-
-
-def _blurred(data: SequenceDataModule, split: Split, count: int, time: int) -> Tensor:
-    """Give step `time` of the first digits of a split, blurred so that a pen one pixel aside is near, `(N, H W)`."""
-    parts = []
-    for index in torch.arange(count).split(5000):
-        frames = data.sequences(split, index, time).observation[:, -1].float()  # (B, 1, H, W)
-        parts.append(avg_pool2d(frames, 5, stride=1, padding=2).flatten(1))  # (B, H W)
-    return torch.cat(parts)

@@ -91,7 +91,7 @@ def test_a_set_compared_with_itself_is_the_same(capsys, make_arrays, tmp_path):
     assert lines[-1].split()[-3:] == ["1.000", "/", "1.000"]
 
 
-COMMANDS = ["build-strokes", "fetch", "compare-strokes", "show", "collect", "info", "check"]
+COMMANDS = ["build-strokes", "build-classifiers", "fetch", "compare-strokes", "show", "collect", "info", "check"]
 
 
 def test_help_has_an_example_of_every_command(capsys):

@@ -68,6 +68,7 @@ def test_the_mask_is_true_until_a_digit_is_whole(source, points_per_step, steps)
 
     expected = torch.arange(1, 9) <= torch.tensor(steps)[:, None]
     assert torch.equal(batch.mask, expected)
+    assert strokes.steps("train")[:3].tolist() == steps
 
 
 def test_a_cut_digit_is_the_beginning_of_the_whole_one(source):

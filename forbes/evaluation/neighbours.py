@@ -1,0 +1,48 @@
+"""Training digits that begin alike: what may become of a beginning, without asking any model."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from forbes.data import SequenceDataModule, Strokes
+
+__all__ = ["Beginnings", "last_frame", "mean_frame"]
+
+
+def last_frame(frames: Tensor) -> Tensor:
+    """Look at where the pen has been, `(B, T, C, H, W)` to `(B, C, H, W)`."""
+    return frames[:, -1].float()
+
+
+def mean_frame(frames: Tensor) -> Tensor:
+    """Look at where the pen has been and in which order, since frames are cumulative; shapes as of `last_frame`."""
+    return frames.sum(1).float() / frames.shape[1]
+
+
+class Beginnings:
+    """The training digits that go on after some step, by what they look like there.
+
+    They are compared after a blur of five pixels, so that a pen one pixel aside is near.
+
+    Args:
+        data: of strokes.
+        time: steps of the beginning.
+        look: makes one picture of its frames, `last_frame` or `mean_frame`.
+    """
+
+    def __init__(self, data: SequenceDataModule, time: int, look: Callable[[Tensor], Tensor]) -> None:
+        assert isinstance(data.source, Strokes)
+        self.look = look
+        self.index = torch.nonzero(data.source.steps("train") > time)[:, 0]  # (M,)
+        parts = (data.sequences("train", index, time).observation for index in self.index.split(5000))
+        self.pictures = torch.cat([self._picture(frames) for frames in parts])  # (M, H W)
+
+    def nearest(self, frames: Tensor, count: int) -> Tensor:
+        """Find the training digits that begin most like these, `(B, T, C, H, W)`, by index, `(B, count)`."""
+        distance = torch.cdist(self._picture(frames), self.pictures)  # (B, M)
+        return self.index[distance.topk(min(count, len(self.index)), largest=False).indices]
+
+    def _picture(self, frames: Tensor) -> Tensor:
+        return avg_pool2d(self.look(frames), 5, stride=1, padding=2).flatten(1)  # (B, H W)

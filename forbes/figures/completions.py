@@ -1,0 +1,120 @@
+"""Completions of digits in pictures: what is drawn and its class, the scores, and the error of the best of n."""
+
+from collections.abc import Sequence
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import StrMethodFormatter
+from torch import Tensor
+
+from forbes.data import SequenceBatch
+from forbes.evaluation.completion_scores import entropy
+from forbes.evaluation.completion_study import Row, Study
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.predictions import complete
+from forbes.figures.grids import Bars, Panel, draw_panels
+from forbes.figures.style import BLACK, GREY, PAGE, PALETTE, paper_style
+from forbes.models import BeliefModel
+from forbes.seeding import derive_seed
+
+__all__ = ["by_ambiguity", "drawings", "errors", "scores"]
+
+_SHOWN = 5
+"""Completions of each digit."""
+_SCORES = {  # of the class, with the rows that are no model's
+    "js[end]": ("JS to the reference, nats", ("similar",)),
+    "entropy[end]": ("entropy of the class, nats", ("similar", "reference")),
+    "nll[end]": ("−log p of the label, nats", ("similar", "reference")),
+    "clear[end]": ("share of clear digits", ("similar", "truth")),
+}
+_LINES = {"similar": ":", "reference": "--", "truth": "-."}
+
+
+def by_ambiguity(reference: Tensor, count: int) -> Tensor:
+    """Choose digits at equal distances in the order of their entropy under the reference, `(B, 10)`, the highest first.
+
+    No model has a say in the choice; `(count,)`, int64, or fewer where there are fewer digits.
+    """
+    order = entropy(reference).argsort(descending=True, stable=True)  # (B,)
+    return order[torch.linspace(0, len(order) - 1, min(count, len(order))).round().long()]
+
+
+def drawings(study: Study, models: Sequence[BeliefModel], batch: SequenceBatch, place: Tensor, seed: int) -> Figure:
+    """Draw beginnings from the most to the least ambiguous, with completions and the classes that these show.
+
+    Args:
+        study: of one length of the prefix.
+        models: of its runs.
+        batch: the digits to draw, up to the end of the longest.
+        place: of them among the prefixes of the study, `(R,)`.
+        seed: of the completions.
+    """
+    context, end = study.prefixes.context, study.prefixes.steps[place]  # (R,)
+    digit = torch.arange(len(place))
+    truth, seen = (batch.observation[digit, step - 1][:, None].float() for step in (end, torch.full_like(end, context)))
+    reference = study.reference.classes[place].numpy()  # (R, 10)
+    ambiguity = [f"H = {value:.2f}" for value in study.reference.scores["entropy[end]"][place].tolist()]
+    panels: list[Panel | Bars] = [
+        Panel("truth", truth, BLACK, ["end"]),
+        Panel("seen", seen, GREY, [f"t={context}"]),
+        Bars("reference", reference, GREY, notes=ambiguity),
+    ]
+    for row, model, colour in zip(study.runs, models, cycle(PALETTE), strict=False):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive_seed(seed, "drawings", context))
+            frames = complete(model, batch, context, _SHOWN).frames[:, digit, end - context - 1]  # (S, R, 1, H, W)
+        notes = [f"JS = {value:.2f}" for value in row.scores["js[end]"][place].tolist()]
+        panels.append(Panel(row.name, frames.transpose(0, 1), colour))
+        panels.append(Bars("their classes", row.classes[place].numpy(), colour, reference, notes))
+    return draw_panels(panels)
+
+
+def scores(studies: Sequence[Study]) -> Figure:
+    """Draw scores of the class against the length of the beginning, with standard errors over digits."""
+    with paper_style():
+        figure = Figure((PAGE, 2.1), layout="constrained")
+        panels = figure.subplots(1, len(_SCORES))
+        labelled: dict[str, Any] = {}
+        for axes, (score, (title, beside)) in zip(panels, _SCORES.items(), strict=True):
+            for number, colour in zip(range(len(studies[0].runs)), cycle(PALETTE), strict=False):
+                _draw_line(axes, studies, [one.runs[number] for one in studies], score, colour, "-")
+            for name in beside:
+                rows = [getattr(one, name) for one in studies]
+                _draw_line(axes, studies, rows, score, GREY, _LINES[name])
+            axes.set(title=title, xlabel="steps seen", xticks=[one.prefixes.context for one in studies])
+            axes.set_ylim(bottom=0)
+            labelled |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+        figure.legend(
+            list(labelled.values()), list(labelled), loc="outside upper center", ncols=len(labelled), handlelength=3
+        )
+    return figure
+
+
+def _draw_line(axes: Axes, studies: Sequence[Study], rows: Sequence[Row], score: str, colour: str, line: str) -> None:
+    found = [Estimate.of(row.scores[score]) for row in rows]
+    steps = [study.prefixes.context for study in studies]
+    means, widths = ([getattr(one, name) for one in found] for name in ("mean", "standard_error"))
+    axes.errorbar(steps, means, widths, fmt=f".{line}", color=colour, label=rows[0].name, capsize=2, markersize=3)
+
+
+def errors(studies: Sequence[Study]) -> Figure:
+    """Draw the error of the best of n completions (lines) and of their average picture (dashed) against n."""
+    with paper_style():
+        figure = Figure((PAGE, 2.3), layout="constrained")
+        panels = figure.subplots(1, len(studies), squeeze=False, sharey=True)[0]
+        for axes, study in zip(panels, studies, strict=True):
+            rows = [*zip(study.runs, cycle(PALETTE), strict=False), (study.similar, GREY)]
+            for row, colour in rows:
+                number = np.arange(1, len(row.best) + 1)
+                axes.plot(number, row.best, color=colour, label=f"{row.name}, best of n")
+                axes.plot(number, row.average, "--", color=colour, label="average of n")
+            axes.set(title=f"{study.prefixes.context} steps seen", xlabel="completions, n", xscale="log")
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.set_ylim(bottom=0)
+        panels[0].set_ylabel("squared error in pixels")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(rows))
+    return figure
