@@ -13,7 +13,16 @@ from forbes.envs import BrokenEnvironmentError, Environment, Step
 from forbes.errors import ForbesError
 from forbes.seeding import derive_seed
 
-__all__ = ["MakePolicy", "Policy", "collect_episodes", "describe_environment", "play", "random_policy"]
+__all__ = [
+    "MakePolicy",
+    "Policy",
+    "collect_episodes",
+    "describe_environment",
+    "episode_seed",
+    "play",
+    "play_whole",
+    "random_policy",
+]
 
 Policy: TypeAlias = Callable[[NDArray[Any]], NDArray[np.float32]]
 """Chooses a_t, float32 `(A,)`, when it is shown o_t; it lives for one episode, so it may remember."""
@@ -83,14 +92,24 @@ def collect_episodes(
         ForbesError: where an episode breaks three times, or cannot be stored.
     """
     for number in range(writer.watermark, until):
-        chance = derive_seed(seed, "episode", number) % 2**32  # what numpy's older generators take
-        episode = _play_whole(environment, make_policy, chance, number)
+        chance = episode_seed(seed, number)
+        episode = play_whole(environment, make_policy, chance, number)
         yield writer.append(episode, chance, policy, describe_environment(environment))
 
 
-def _play_whole(
+def episode_seed(seed: int, number: int) -> int:
+    """Give the seed of an episode of a collection and of its policy."""
+    return derive_seed(seed, "episode", number) % 2**32  # what numpy's older generators take
+
+
+def play_whole(
     environment: Environment, make_policy: MakePolicy, seed: int, number: int, attempts: int = _ATTEMPTS
 ) -> Episode:
+    """Play an episode, and play it again where it breaks; `seed` and `number` are the episode's own.
+
+    Raises:
+        ForbesError: where it breaks three times.
+    """
     try:
         return play(environment, make_policy(environment, seed), seed)
     except BrokenEnvironmentError as failure:
@@ -100,7 +119,7 @@ def _play_whole(
                 "Mend the environment"
             ) from failure
         print(f"forbes: {failure}; episode {number} is dropped and played again", file=sys.stderr)
-    return _play_whole(environment, make_policy, seed, number, attempts - 1)
+    return play_whole(environment, make_policy, seed, number, attempts - 1)
 
 
 def describe_environment(environment: Environment) -> dict[str, Any]:

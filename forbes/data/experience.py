@@ -7,9 +7,10 @@ from typing import Any
 
 from torch import Tensor
 
-from forbes.data.collection import MakePolicy, collect_episodes
+from forbes.data.collection import MakePolicy, collect_episodes, describe_environment, episode_seed
 from forbes.data.episode_store import EpisodeWriter
 from forbes.data.episodes import EpisodeRecord
+from forbes.data.player import Player
 from forbes.data.replay import Replay, Windows
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.envs import EnvironmentProcess, find_environment
@@ -44,6 +45,11 @@ class Experience(SequenceSource):
         """The environment, in a process that starts when it is first asked for."""
         return EnvironmentProcess(self._make)
 
+    @cached_property
+    def player(self) -> Player:
+        """What plays while this process trains; it starts when it is first asked for."""
+        return Player(self._make)
+
     @property
     def observation_shape(self) -> tuple[int, ...]:  # type: ignore[override]
         """See `SequenceSource`."""
@@ -63,9 +69,9 @@ class Experience(SequenceSource):
         """Leave the folder and end the environment; what is known of the episodes stays known."""
         if self._writer is not None:
             self._writer.__exit__()
-        if "environment" in self.__dict__:
-            self.environment.close()
-            del self.environment
+        for name in ("environment", "player"):
+            if name in self.__dict__:
+                self.__dict__.pop(name).close()
 
     def collect(self, until: int, make_policy: MakePolicy, policy: str, seed: int) -> Iterator[EpisodeRecord]:
         """Play until there have been so many episodes; episode n depends on (seed, n) and the policy only.
@@ -79,6 +85,29 @@ class Experience(SequenceSource):
         for record in collect_episodes(self.environment, self._open(), make_policy, policy, until, seed):
             self._look()
             yield record
+
+    def begin(self, make_policy: MakePolicy, seed: int) -> None:
+        """Let the next episode be played while this process does something else; `finish` stores it.
+
+        Args:
+            make_policy: as for `collect`; can be pickled.
+            seed: as for `collect`.
+        """
+        number = self._open().watermark
+        self.player.begin(make_policy, number, episode_seed(seed, number))
+
+    def finish(self, policy: str, seed: int) -> EpisodeRecord:
+        """Wait for the episode that was begun, and store it; arguments as for `collect`."""
+        writer, episode = self._open(), self.player.finish()
+        chance = episode_seed(seed, writer.watermark)
+        record = writer.append(episode, chance, policy, describe_environment(self.environment))
+        self._look()
+        return record
+
+    @property
+    def newest(self) -> EpisodeRecord:
+        """The record of the latest episode."""
+        return self._open().records[self._open().watermark - 1]
 
     @property
     def env_steps(self) -> int:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from forbes.envs.base import Environment, Step, check_step
 from forbes.errors import ForbesError
 
-__all__ = ["BrokenEnvironmentError", "EnvironmentProcess"]
+__all__ = ["BrokenEnvironmentError", "EnvironmentProcess", "belong_to_parent"]
 
 START_LIMIT = 180.0
 """Seconds to import and build an environment; two tries of a renderer, of 60 each, among them."""
@@ -148,9 +148,7 @@ class EnvironmentProcess(Environment):
 
 def _serve(connection: Connection, make: Callable[[], Environment]) -> None:
     """Run in the process: build the environment and answer until the parent is gone or something is wrong."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # a signal to the group is the parent's to handle
-    threading.Thread(target=_follow_parent, daemon=True).start()
+    belong_to_parent()
     try:
         environment = make()
         shape = tuple(environment.observation_shape)
@@ -167,6 +165,13 @@ def _serve(connection: Connection, make: Callable[[], Environment]) -> None:
         refused = isinstance(error, ForbesError)
         sentence = str(error) if refused else f"{type(error).__name__}: {error}"
         connection.send(_Report(" ".join(sentence.split()), traceback.format_exc(), refused))
+
+
+def belong_to_parent() -> None:
+    """Leave signals to the parent of this process, which gets those to the group too, and end when it ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_follow_parent, daemon=True).start()
 
 
 def _follow_parent() -> None:

@@ -1,20 +1,23 @@
 """What agents have in common: a world model that knows rewards too, and a choice of actions."""
 
+import copy
 import math
 from abc import ABC, abstractmethod
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 from torch import Tensor
 
-from forbes.control.agent import Choice
+from forbes.control.agent import Agent, Choice
 from forbes.control.policy import ScalarHead
 from forbes.data import SequenceBatch
+from forbes.envs import Environment
 from forbes.errors import ForbesError
 from forbes.models import Filtered, StateSpaceModel
 from forbes.models.elbo import ElboTerms
 from forbes.training.world_model import WorldModel, require_at_least
 
-__all__ = ["ActingModel"]
+__all__ = ["Acting", "ActingModel"]
 
 
 class ActingModel(WorldModel, ABC):
@@ -71,3 +74,20 @@ class ActingModel(WorldModel, ABC):
         reward_mean = terms.mean_over_steps(reward)
         self.log("train/reward", reward_mean.detach())
         return self.loss(terms) - reward_mean
+
+
+@dataclass(frozen=True)
+class Acting:
+    """Makes the policy by which an agent plays an episode: a `MakePolicy` that can be pickled."""
+
+    agent: ActingModel
+    exploring: bool
+
+    @classmethod
+    def as_it_is(cls, agent: ActingModel, exploring: bool) -> Self:
+        """Take a copy, on the CPU, that does not learn any further."""
+        return cls(copy.deepcopy(agent).cpu().eval(), exploring)
+
+    def __call__(self, environment: Environment, seed: int) -> Agent:
+        """See `MakePolicy`."""
+        return Agent(self.agent.model, self.agent.choose(self.exploring), seed)

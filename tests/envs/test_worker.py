@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from processes import ends
 from toy_environments import Echo, Troubled
 
 from forbes.envs import BrokenEnvironmentError, EnvironmentProcess, find_environment
@@ -88,15 +89,6 @@ def test_an_error_that_a_user_can_mend_is_not_tried_again():
     assert "Traceback" in "".join(error.value.__notes__)  # for --debug
 
 
-def gone(process):
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return True
-    with open(f"/proc/{process}/stat") as file:  # nobody may be left to collect it
-        return file.read().rpartition(") ")[2].startswith("Z")
-
-
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_it_ends_with_its_parent_even_within_a_step_that_never_returns(tmp_path):
     program = """
@@ -127,9 +119,6 @@ if __name__ == "__main__":
             time.sleep(0.05)
         parent.send_signal(signal.SIGKILL)
 
-    deadline = time.monotonic() + 30
-    while not (ended := gone(child)) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    if not ended:
+    if not (ended := ends(child)):
         os.kill(child, signal.SIGKILL)
     assert ended

@@ -83,6 +83,32 @@ def test_a_killed_run_goes_on_to_the_same_numbers_and_the_same_episodes(run, tmp
     assert any((other / "episodes" / "set_aside").iterdir())
 
 
+def test_overlapped_episodes_are_one_epoch_older_and_resume_to_the_same_numbers(run, tmp_path, monkeypatch):
+    """The first epoch's agent plays the third episode, as without; from then on it is always one epoch behind."""
+
+    def kill(self, loss):
+        if self.global_step == 6:
+            raise Killed
+
+    text = write_config(tmp_path).read_text().replace("seed_episodes: 2", "seed_episodes: 2, overlap: true")
+    (tmp_path / "overlap.yaml").write_text(text)
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert fit("--config", tmp_path / "overlap.yaml", "--run_dir", whole) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(ImaginationActorCritic, "on_before_backward", kill)
+        with pytest.raises(Killed):
+            fit("--config", tmp_path / "overlap.yaml", "--run_dir", cut)
+    assert fit("--resume", cut) == 0
+
+    pd.testing.assert_frame_equal(read_metrics(cut), read_metrics(whole), check_exact=True)
+    stores = [EpisodeStore(path / "episodes") for path in (whole, cut, run)]
+    actions = [[store.episode(number).action for number in store.records] for store in stores]
+    assert [len(each) for each in actions] == [5, 5, 4]
+    np.testing.assert_array_equal(actions[0], actions[1])
+    np.testing.assert_array_equal(actions[0][:2], actions[2][:2])
+    assert (actions[0][2] != actions[2][2]).any()  # without, the first epoch's updates come before it is played
+
+
 def test_a_finished_run_can_be_made_longer(run, tmp_path):
     """Two epochs and one more are three."""
     other = tmp_path / "run"

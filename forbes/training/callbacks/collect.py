@@ -7,12 +7,11 @@ from typing import cast
 
 from lightning import Callback, LightningModule, Trainer
 
-from forbes.control.agent import Agent
 from forbes.data import Experience
 from forbes.data.collection import MakePolicy, play, random_policy
 from forbes.errors import ForbesError
 from forbes.seeding import derive_seed
-from forbes.training.acting import ActingModel
+from forbes.training.acting import Acting, ActingModel
 
 __all__ = ["Collect"]
 
@@ -24,6 +23,9 @@ class Collect(Callback):
     with exploration. Episode n is a function of (seed, n) and the weights, so that a resumed run plays the same.
     The store is the run folder's `episodes/`.
 
+    With `overlap`, the episode that epoch e + 1 begins with is played during epoch e, by the agent as it was when e
+    began: always one epoch older than it would be otherwise, and so no less reproducible.
+
     Logs, at the end of the epoch: `env_steps` (frames of the simulator, action repeat included), `agent_steps`,
     `return/exploring` of the newest episode, and `return/acting`, the mean return of episodes without exploration.
 
@@ -32,19 +34,25 @@ class Collect(Callback):
         evaluate_every: epochs between two evaluations, of which the last epoch has one.
         evaluation_episodes: of each; their seeds are those of no other episode, and the same each time.
         seed: of all the episodes.
+        overlap: play in a process of its own, on the CPU, while the agent learns.
 
     Raises:
         ForbesError: where a number is below 1; in a fit, where model or data are not those of an agent.
     """
 
     def __init__(
-        self, seed_episodes: int = 5, evaluate_every: int = 10, evaluation_episodes: int = 1, seed: int = 0
+        self,
+        seed_episodes: int = 5,
+        evaluate_every: int = 10,
+        evaluation_episodes: int = 1,
+        seed: int = 0,
+        overlap: bool = False,
     ) -> None:
         numbers = {"seed_episodes": seed_episodes, "evaluate_every": evaluate_every}
         for name, value in (numbers | {"evaluation_episodes": evaluation_episodes}).items():
             if value < 1:
                 raise ForbesError(f"Collect: {name} is {value}, expected at least 1")
-        self.seed_episodes, self.seed = seed_episodes, seed
+        self.seed_episodes, self.seed, self.overlap = seed_episodes, seed, overlap
         self.evaluate_every, self.evaluation_episodes = evaluate_every, evaluation_episodes
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -67,23 +75,25 @@ class Collect(Callback):
         source, agent = _experience(trainer), cast(ActingModel, pl_module)
         for record in source.collect(self.seed_episodes, random_policy, "random", self.seed):
             _say(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
-        newest = None
         with _acting(agent, exploring=True) as make_policy:
-            for record in source.collect(
-                self.seed_episodes + trainer.current_epoch, make_policy, type(agent).__name__, self.seed
-            ):
-                newest = record
+            until = self.seed_episodes + trainer.current_epoch
+            list(source.collect(until, make_policy, type(agent).__name__, self.seed))
+        if self.overlap:
+            source.begin(Acting.as_it_is(agent, exploring=True), self.seed)
         steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
-        if newest is not None:
-            steps["return/exploring"] = newest.total_reward
+        if source.newest.number >= self.seed_episodes:
+            steps["return/exploring"] = source.newest.total_reward
         agent.log_dict(steps, on_step=False, on_epoch=True, batch_size=1)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Measure the agent every few epochs, and at the end."""
+        """Store the episode played meanwhile; measure the agent every few epochs, and at the end."""
+        agent, source = cast(ActingModel, pl_module), _experience(trainer)
+        if self.overlap:
+            source.finish(type(agent).__name__, self.seed)
         number = trainer.current_epoch + 1
         if number % self.evaluate_every and number != trainer.max_epochs:
             return
-        agent, environment = cast(ActingModel, pl_module), _experience(trainer).environment
+        environment = source.environment
         returns = []
         with _acting(agent, exploring=False) as make_policy:
             for place in range(self.evaluation_episodes):
@@ -95,9 +105,9 @@ class Collect(Callback):
 @contextmanager
 def _acting(agent: ActingModel, exploring: bool) -> Iterator[MakePolicy]:
     """Give what makes the agent's policy for an episode, in eval mode."""
-    training, choose = agent.training, agent.choose(exploring)
+    training = agent.training
     agent.eval()
-    yield lambda _, seed: Agent(agent.model, choose, seed)
+    yield Acting(agent, exploring)
     agent.train(training)
 
 

@@ -1,0 +1,107 @@
+"""Episodes that another process plays: the same as here, by the policy as it was, and every failure is said."""
+
+import os
+import signal
+import sys
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from processes import ends
+from toy_environments import Parrot, Troubled
+
+from forbes.data.collection import play
+from forbes.data.player import Player
+from forbes.errors import ForbesError
+
+
+class Said:
+    """Says what its tensor holds, at every step."""
+
+    def __init__(self, number):
+        self.number = torch.full((1,), number)
+
+    def __call__(self, environment, seed):
+        return lambda observation: self.number.numpy()
+
+
+@pytest.fixture(scope="module")
+def player():
+    player = Player(partial(Parrot, steps=8))
+    yield player
+    player.close()
+
+
+def test_the_episode_is_that_of_this_process(player):
+    player.begin(Said(0.5), number=0, seed=3)
+
+    for ours, theirs in zip(player.finish(), play(Parrot(8), Said(0.5)(None, 3), 3), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_policy_does_not_change_while_it_plays(player):
+    """Tensors sent through a pipe in torch's own way share their memory."""
+    policy = Said(0.5)
+    player.begin(policy, number=0, seed=3)
+    policy.number.fill_(0.25)
+
+    assert (player.finish().action[1:] == 0.5).all()
+
+
+def test_one_episode_after_another(player):
+    for number in range(3):
+        player.begin(Said(number / 4), number, seed=number)
+        assert player.finish().action[-1] == number / 4
+
+
+def test_a_broken_episode_is_played_again(tmp_path):
+    player = Player(partial(Troubled, "raises", tmp_path / "ledger"))
+    player.begin(Said(0.5), number=0, seed=0)
+    assert len(player.finish().action) == 7
+    player.close()
+
+
+def test_an_environment_that_breaks_each_time_is_named(tmp_path):
+    player = Player(partial(Troubled, "raises", tmp_path / "ledger", times=9))
+    player.begin(Said(0.5), number=4, seed=0)
+    with pytest.raises(ForbesError, match="so broke episode 4 3 times"):
+        player.finish()
+    player.close()
+
+
+class Kills(Said):
+    """Is the end of whoever asks it."""
+
+    def __call__(self, environment, seed):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_player_that_dies_is_named():
+    player = Player(partial(Parrot, steps=8))
+    player.begin(Kills(0.5), number=0, seed=0)
+    with pytest.raises(ForbesError, match="the process that plays episodes has died, exit code -9"):
+        player.finish()
+    player.close()
+
+
+class Told(Said):
+    """Says in a file which process its environment is."""
+
+    def __call__(self, environment, seed):
+        self.path.write_text(str(environment.describe()["process"]))
+        return super().__call__(environment, seed)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_nothing_is_left_of_a_player_closed_in_the_midst_of_an_episode(tmp_path):
+    ledger, policy = tmp_path / "ledger", Told(0.5)
+    policy.path = tmp_path / "process"
+    player = Player(partial(Troubled, "hangs", ledger))
+    player.begin(policy, number=0, seed=0)
+    while not ledger.exists():  # it has begun to hang
+        time.sleep(0.05)
+    player.close()
+
+    assert ends(int(policy.path.read_text()))
