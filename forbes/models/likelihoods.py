@@ -8,6 +8,8 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torch.nn.functional import log_softmax, one_hot, softplus
 
+from forbes.errors import ForbesError
+
 __all__ = ["Bernoulli", "Likelihood", "Normal", "OneHot", "VectorNormal"]
 
 
@@ -58,19 +60,33 @@ class Bernoulli(Likelihood):
 class Normal(Likelihood):
     r"""Pixels of fixed spread: :math:`N(x/scale - 1/2;\, output,\, \sigma^2)`, constant kept.
 
+    With fewer than 8 bits, bytes are made coarser and the steps between them filled with noise, new for every reading, as
+    in PlaNet (Hafner et al., 2019, arXiv 1811.04551):
+
+    .. math:: N\left(\lfloor x / 2^{8-b} \rfloor / 2^b + u / 2^b - 1/2;\, output,\, \sigma^2\right), \qquad u \sim U[0, 1)
+
     Args:
         std: :math:`\sigma`; 1 in PlaNet, Dreamer and the paper.
         scale: the largest stored value, 255 for images and 1 for binary frames.
+        bits: b; 5 in PlaNet and the paper, all 8 in Dreamer.
+
+    Raises:
+        ForbesError: when `bits` is not of 1 to 8, or below 8 for another scale than 255.
     """
 
-    def __init__(self, std: float = 1.0, scale: float = 255.0) -> None:
-        self.std = std
-        self.scale = scale
-        self.name = f"normal({std:g})"
+    def __init__(self, std: float = 1.0, scale: float = 255.0, bits: int = 8) -> None:
+        if not 1 <= bits <= 8 or (bits < 8 and scale != 255):
+            raise ForbesError(f"Normal: bits is {bits} at scale {scale:g}, expected 1 to 8 of bytes, scale 255")
+        self.std, self.scale, self.bits = std, scale, bits
+        self.name = f"normal({std:g})" if bits == 8 else f"normal({std:g},bits={bits})"
 
     def target(self, observation: Tensor) -> Tensor:
         """See `Likelihood.target`: values in [-1/2, 1/2]."""
-        return observation.float() / self.scale - 0.5
+        if self.bits == 8:
+            return observation.float() / self.scale - 0.5
+        levels = 2**self.bits
+        coarse = (observation.float() * (levels / 256)).floor()
+        return (coarse + torch.rand_like(coarse)) / levels - 0.5
 
     def mean(self, output: Tensor) -> Tensor:
         """See `Likelihood.mean`."""

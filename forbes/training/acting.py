@@ -27,7 +27,7 @@ class ActingModel(WorldModel, ABC):
 
     Args:
         control_dim: width of the reward's perceptron, and of what else acts.
-        control_layers: hidden layers of each.
+        reward_layers: hidden layers of the reward's.
         exploration: standard deviation of the noise on the actions of collected episodes.
         **world: arguments of `WorldModel`.
 
@@ -35,10 +35,10 @@ class ActingModel(WorldModel, ABC):
         ForbesError: when a size is below 1, the noise below 0, or the data have no actions.
     """
 
-    def __init__(self, control_dim: int = 200, control_layers: int = 2, exploration: float = 0.3, **world: Any) -> None:
+    def __init__(self, control_dim: int = 200, reward_layers: int = 2, exploration: float = 0.3, **world: Any) -> None:
         super().__init__(**world)
         name = type(self).__name__
-        require_at_least(1, name, control_dim=control_dim, control_layers=control_layers)
+        require_at_least(1, name, control_dim=control_dim, reward_layers=reward_layers)
         require_at_least(0, name, exploration=exploration)
         if type(self.model) is not StateSpaceModel:
             raise ForbesError(
@@ -50,7 +50,7 @@ class ActingModel(WorldModel, ABC):
                 f"{name}: the data have no actions, expected some. Choose another source, or a WorldModel"
             )
         self.exploration = exploration
-        self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, control_layers)
+        self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, reward_layers)
 
     @abstractmethod
     def choose(self, exploring: bool) -> Choice:

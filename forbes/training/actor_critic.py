@@ -36,7 +36,8 @@ class ImaginationActorCritic(ActingModel):
         discount: :math:`\gamma`.
         lambda_: :math:`\lambda` of the returns.
         control_dim: width of actor, critic and reward.
-        control_layers: hidden layers of each.
+        actor_layers: hidden layers of the actor.
+        critic_layers: hidden layers of the critic.
         actor_rate: learning rate of the actor.
         critic_rate: learning rate of the critic.
         **acting: arguments of `ActingModel` and `WorldModel`; their learning rate is that of model and reward.
@@ -52,19 +53,20 @@ class ImaginationActorCritic(ActingModel):
         discount: float = 0.99,
         lambda_: float = 0.95,
         control_dim: int = 200,
-        control_layers: int = 2,
+        actor_layers: int = 2,
+        critic_layers: int = 2,
         actor_rate: float = 8e-5,
         critic_rate: float = 8e-5,
         **acting: Any,
     ) -> None:
-        super().__init__(control_dim, control_layers, **acting)
+        super().__init__(control_dim, **acting)
         name = type(self).__name__
-        require_at_least(1, name, trajectories=trajectories)
+        require_at_least(1, name, trajectories=trajectories, actor_layers=actor_layers, critic_layers=critic_layers)
         require_at_least(2, name, horizon=horizon)
         require_at_least(0, name, actor_rate=actor_rate, critic_rate=critic_rate)
         features = self.model.hidden_dim + self.model.state_dim
-        self.actor = Actor(features, self.model.action_dim, control_dim, control_layers)
-        self.critic = ScalarHead(features, control_dim, control_layers)
+        self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers)
+        self.critic = ScalarHead(features, control_dim, critic_layers)
         self.trajectories, self.horizon, self.discount, self.lambda_ = trajectories, horizon, discount, lambda_
         self.actor_rate, self.critic_rate = actor_rate, critic_rate
 

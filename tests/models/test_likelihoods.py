@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import distributions
 
+from forbes.errors import ForbesError
 from forbes.models import Bernoulli, Normal, OneHot, VectorNormal
 
 SHAPE = (5, 3, 2, 4, 4)  # (B, T, C, H, W)
@@ -49,6 +50,27 @@ def test_normal_centres_stored_values_on_zero(scale):
 )
 def test_name_tells_the_densities_apart(likelihood, name):
     assert likelihood.name == name
+
+
+@pytest.mark.parametrize("bits", [1, 5, 7])
+def test_fewer_bits_keep_the_leading_ones_and_fill_the_rest_with_noise(bits):
+    """Uniform within its step, a byte is known to lie there and no better: mean and spread are those of the step."""
+    bytes_ = torch.arange(256, dtype=torch.uint8)
+    torch.manual_seed(0)
+    readings = Normal(bits=bits).target(bytes_.expand(2000, -1)) + 0.5  # (2000, 256)
+
+    step = 2.0**-bits
+    floor = (bytes_ >> (8 - bits)).float() * step
+    assert ((readings >= floor) & (readings <= floor + step)).all()  # the upper end by rounding only
+    error = step / 12**0.5 / 2000**0.5  # of a mean of 2,000 uniform numbers
+    torch.testing.assert_close(readings.mean(0), floor + step / 2, rtol=0, atol=5 * error)
+    assert Normal(bits=bits).name == f"normal(1,bits={bits})"
+
+
+@pytest.mark.parametrize(("bits", "scale"), [(0, 255), (9, 255), (5, 1)])
+def test_bits_are_of_bytes(bits, scale):
+    with pytest.raises(ForbesError, match=f"bits is {bits} at scale {scale}, expected 1 to 8"):
+        Normal(scale=scale, bits=bits)
 
 
 @pytest.mark.parametrize("likelihood", [Bernoulli(), Normal()])
