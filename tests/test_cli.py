@@ -255,22 +255,39 @@ def test_the_other_loops_need_a_trained_model(command, tiny_config, capsys):
     )
 
 
+TOYS = ["--allow-module", "toy_environments"]
 SHORT_EPISODES = {  # what an agent's configuration spends on playing
     "evaluation_episodes: 20": "evaluation_episodes: 1, seed_episodes: 1",
     "candidates: 200": "candidates: 20",
     "iterations: 5": "iterations: 1",
+    "{class_path: Collect}": "{class_path: Collect, init_args: {seed_episodes: 1}}",
 }
+OVERLAYS = {"debug.yaml": "strokes/forbes.yaml", "dmc/cpu.yaml": "dmc/dreamer.yaml"}
+
+
+@pytest.fixture(scope="session")
+def screens(tmp_path_factory):
+    """Ten episodes of a toy that looks like a task of DeepMind Control."""
+    folder = tmp_path_factory.mktemp("episodes")
+    collect = ["data", "collect", "--task", "Screen", "--episodes", "10", "-o", str(folder / "screens")]
+    assert main([*collect, *TOYS]) == 0
+    return folder / "screens"
 
 
 @pytest.mark.parametrize("config", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: str(path.relative_to(CONFIGS)))
-def test_every_configuration_trains(config, in_tmp_path):
+def test_every_configuration_trains(config, in_tmp_path, screens):
     text = config.read_text()
     for wanted, short in SHORT_EPISODES.items():
         text = text.replace(wanted, short)
     Path("config.yaml").write_text(text)
-    base = [] if "model" in yaml.safe_load(text) else ["--config", f"{CONFIGS}/strokes/forbes.yaml"]
-    paper_set = {"data.source.origin": "bundled"} if "origin: dejong" in text else {}  # it is not in the repository
-    small = paper_set | {
+    name = str(config.relative_to(CONFIGS))
+    base = ["--config", f"{CONFIGS}/{OVERLAYS[name]}"] if name in OVERLAYS else []
+    elsewhere = {"data.source.origin": "bundled"} if "origin: dejong" in text else {}  # it is not in the repository
+    if name.startswith("dmc/"):
+        elsewhere = {"data.length": 4, "trainer.max_epochs": 2}
+        elsewhere |= {"data.source.path": screens} if "Replay" in text else {"data.source.task": "Screen"}
+        elsewhere |= {"model.candidates": 20, "model.best": 5} if "PlanningAgent" in text else {}
+    small = {
         "data.batch_size": 4,
         "data.updates_per_epoch": 1,
         "data.validation_sequences": 4,
@@ -278,8 +295,8 @@ def test_every_configuration_trains(config, in_tmp_path):
         "trainer.log_every_n_steps": 1,
         "trainer.accelerator": "cpu",
     }
-    flags = [f"--{name}={value}" for name, value in small.items()]
+    flags = [f"--{name}={value}" for name, value in (small | elsewhere).items()]
 
-    assert main(["fit", *base, "--config", "config.yaml", *flags, "--run_dir", "run"]) == 0
+    assert main(["fit", *base, "--config", "config.yaml", *flags, "--run_dir", "run", *TOYS]) == 0
 
     assert Path("run/checkpoints/last.ckpt").is_file()

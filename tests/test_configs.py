@@ -29,3 +29,13 @@ def test_a_matched_configuration_has_the_parameters_it_claims(config):
     forbes = next(folder / "forbes.yaml" for folder in config.parents if (folder / "forbes.yaml").exists())
     assert parameters(forbes) == other
     assert abs(own / other - 1) < 0.05
+
+
+def test_the_controlled_comparison_differs_in_the_belief_alone():
+    dreamer, forbes = (
+        yaml.safe_load((CONFIGS / "dmc" / f"{name}.yaml").read_text()) for name in ("dreamer", "forbes_n1")
+    )
+
+    beliefs = [config["model"]["init_args"].pop("belief")["class_path"] for config in (dreamer, forbes)]
+    assert beliefs == ["GaussianBelief", "FlowBelief"]
+    assert dreamer == forbes

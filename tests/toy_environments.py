@@ -100,3 +100,18 @@ class Pictures(Environment):
         frame = np.zeros((3, 8, 8), np.uint8)
         frame[:, 2, self.time] = 255
         return frame
+
+
+class Screen(Pictures):
+    """Looks like a task of DeepMind Control, and has its options."""
+
+    def __init__(self, size=64, fast=False, action_repeat=2):
+        self.observation_shape = (3, size, size)
+
+    def picture(self):
+        frame = np.zeros(self.observation_shape, np.uint8)
+        frame[:, 2, self.time] = 255
+        return frame
+
+    def describe(self):
+        return {"task": "Screen"}

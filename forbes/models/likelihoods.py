@@ -60,10 +60,10 @@ class Bernoulli(Likelihood):
 class Normal(Likelihood):
     r"""Pixels of fixed spread: :math:`N(x/scale - 1/2;\, output,\, \sigma^2)`, constant kept.
 
-    With fewer than 8 bits, bytes are made coarser and the steps between them filled with noise, new for every reading, as
-    in PlaNet (Hafner et al., 2019, arXiv 1811.04551):
+    With b < 8 bits, bytes are made coarser and the steps between them filled with noise, new for every reading, as in
+    PlaNet (Hafner et al., 2019, arXiv 1811.04551): the density is about
 
-    .. math:: N\left(\lfloor x / 2^{8-b} \rfloor / 2^b + u / 2^b - 1/2;\, output,\, \sigma^2\right), \qquad u \sim U[0, 1)
+    .. math:: (\lfloor x / 2^{8-b} \rfloor + u) / 2^b - 1/2, \qquad u \sim U[0, 1)
 
     Args:
         std: :math:`\sigma`; 1 in PlaNet, Dreamer and the paper.
