@@ -84,7 +84,7 @@ class Normal(Likelihood):
         """See `Likelihood.target`: values in [-1/2, 1/2]."""
         if self.bits == 8:
             return observation.float() / self.scale - 0.5
-        levels = 2**self.bits
+        levels = 1 << self.bits
         coarse = (observation.float() * (levels / 256)).floor()
         return (coarse + torch.rand_like(coarse)) / levels - 0.5
 
