@@ -1,5 +1,7 @@
 """`forbes rollout`: the video is of the episodes that `forbes evaluate` measures."""
 
+import io
+
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
@@ -34,7 +36,9 @@ def test_the_video_shows_the_episodes_and_the_returns_are_those_of_evaluate(run,
     module, data = load_run(run)
     played = [play_test_episode(module, data.source.environment, 3, number).observation for number in (0, 1)]
     data.source.close()
-    frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(Image.open(path))]
+    frames = [
+        np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(Image.open(io.BytesIO(path.read_bytes())))
+    ]
     expected = np.concatenate(played).transpose(0, 2, 3, 1).repeat(32, 1).repeat(32, 2)  # 256 pixels a side
     np.testing.assert_array_equal(frames, expected)
     assert [each.name for each in path.parent.iterdir()] == ["agent.gif"]
