@@ -21,7 +21,7 @@ def open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, columns:
 
     Args:
         truth: values in [0, 1], `(B, T, C, H, W)`.
-        model: what is expected of the same, from the belief that has seen o_t up to `context`, and o_context later.
+        model: what is expected of the same, by beliefs that have seen o_t; after `context`, no frame any more.
         mask: False after the end of a sequence, which stays white, bool `(B, T)`.
         context: frames that the model sees.
         columns: frames shown, those of the context among them; the others evenly to the last.
@@ -30,7 +30,7 @@ def open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, columns:
     white = 1.0 if truth.shape[2] == 3 else 0.0  # grey values are ink
     rows = rows.where(mask[:, None, :, None, None, None], white)
     groups = list(range(1, context + 1)), _later(context, truth.shape[1], columns - context)
-    titles = "seen, and reconstructed", "imagined by the true actions"
+    titles = "seen, and reconstructed", "imagined under the true actions"
     names = ("truth", "model", "error"), ()
     bands = [
         [
@@ -58,7 +58,7 @@ def imagined_futures(truth: Tensor, futures: Tensor, context: int, columns: int)
     past = truth[None, [time - 1 for time in seen]]  # (1, S, C, H, W)
     true_rest = truth[None, [time - 1 for time in later]]  # (1, K, C, H, W)
     chosen = futures[:, [time - context - 1 for time in later]]  # (N, K, C, H, W)
-    title = f"truth, and {len(futures)} futures imagined from one belief by the true actions"
+    title = f"truth, and {len(futures)} futures imagined from one belief, under the true actions"
     names = [f"future {number + 1}" for number in range(len(futures))]
     above = [Panel("seen", past, BLACK, (), ["truth"]), Panel(title, true_rest, BLACK)]
     pasts = past.expand(len(futures), -1, -1, -1, -1)  # (N, S, C, H, W)

@@ -107,7 +107,7 @@ def test_the_panel_shows_truth_model_and_half_their_difference_around_grey(train
 
     assert [axes.get_title() for axes in figure.axes] == [
         "seen, and reconstructed",
-        "imagined by the true actions",
+        "imagined under the true actions",
         "",
         "",
     ]
