@@ -27,6 +27,7 @@ COMMANDS = {
     "test": Command("run the test loop of a model", _TRAINED, "forbes.training.commands:test"),
     "predict": Command("run the prediction loop of a model", _TRAINED, "forbes.training.commands:predict"),
     "evaluate": Command("measure trained models and compare them", "RUN RUN", "forbes.evaluation.commands:main"),
+    "rollout": Command("film an agent", "RUN --video agent.gif", "forbes.figures.rollout_command:main"),
     "beliefs": Command("hold learned beliefs against exact ones", "RUN RUN", "forbes.evaluation.belief_command:main"),
     "theorem": Command("check Theorem 1 in closed form", "--steps 30", "forbes.evaluation.theorem_command:main"),
     "compare": Command(

@@ -2,7 +2,7 @@
 
 from forbes.cli import main
 
-__all__ = ["fit", "forbes", "write_config"]
+__all__ = ["fit", "forbes", "write_config", "write_image_config"]
 
 CONFIG = """\
 model:
@@ -46,6 +46,19 @@ def write_config(folder, kind="forbes"):
     if kind == "planet":
         text = text.replace("    horizon: 2", "    horizon: 2\n    candidates: 20\n    best: 5\n    iterations: 2")
     path.write_text(text)
+    return path
+
+
+def write_image_config(folder, *callbacks):
+    """Configure an agent that sees images, with further callbacks, each a YAML of one line."""
+    text = (
+        write_config(folder)
+        .read_text()
+        .replace("Parrot, options: {steps: 8}", "Slide")
+        .replace("VectorNormal", "Normal")
+    )
+    path = folder / "images.yaml"
+    path.write_text(text + "".join(f"    - {callback}\n" for callback in callbacks))
     return path
 
 

@@ -284,7 +284,7 @@ def test_every_configuration_trains(config, in_tmp_path, screens):
     base = ["--config", f"{CONFIGS}/{OVERLAYS[name]}"] if name in OVERLAYS else []
     elsewhere = {"data.source.origin": "bundled"} if "origin: dejong" in text else {}  # it is not in the repository
     if name.startswith("dmc/"):
-        elsewhere = {"data.length": 4, "trainer.max_epochs": 2}
+        elsewhere = {"data.length": 6, "trainer.max_epochs": 2}
         elsewhere |= {"data.source.path": screens} if "Replay" in text else {"data.source.task": "Screen"}
         elsewhere |= {"model.candidates": 20, "model.best": 5} if "PlanningAgent" in text else {}
     small = {

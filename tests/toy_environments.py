@@ -115,3 +115,30 @@ class Screen(Pictures):
 
     def describe(self):
         return {"task": "Screen"}
+
+
+class Slide(Environment):
+    """A square that the first action moves to the left or right, on a colour of its own; it is paid for its place."""
+
+    observation_shape, action_dim = (3, 8, 8), 2
+
+    def __init__(self, steps=9):
+        self.steps = steps
+
+    def reset(self, seed):
+        self.time, self.place, self.colour = 0, 3.0, seed % 200
+        return Step(self.picture())
+
+    def step(self, action):
+        self.time += 1
+        self.place = float(np.clip(self.place + 2 * action[0], 0, 7))
+        return Step(self.picture(), self.place, truncated=self.time == self.steps, frames=2)
+
+    def picture(self):
+        frame = np.full((3, 8, 8), self.colour, np.uint8)
+        frame[:, 3:5, round(self.place)] = np.array([[255], [20], [128]], np.uint8)
+        frame[:, 0, 0] = self.time  # so that no two frames are the same
+        return frame
+
+    def describe(self):
+        return {"task": "Slide", "steps": self.steps}

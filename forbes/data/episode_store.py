@@ -143,7 +143,7 @@ class EpisodeWriter(EpisodeStore):
             "number": number,
             "steps": len(episode.reward) - 1,
             "frames": episode.frames,
-            "total_reward": float(episode.reward.sum(dtype="float64")),
+            "total_reward": episode.total_reward,
             "terminated": episode.terminated,
             "seed": seed,
             "policy": policy,

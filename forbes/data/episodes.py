@@ -46,6 +46,11 @@ class Episode(NamedTuple):
     frames: int
     """Frames of the simulator, action repeat included: env steps."""
 
+    @property
+    def total_reward(self) -> float:
+        """The return: the sum of all rewards, without discount."""
+        return float(self.reward.sum(dtype="float64"))
+
 
 class EpisodeRecord(NamedTuple):
     """What the index says of an episode; a line of `index.jsonl`."""

@@ -142,6 +142,10 @@ class Experience(SequenceSource):
         """See `Replay.train_index`."""
         return self._drawn().train_index(batch_size, length, seed, update)
 
+    def latest(self, count: int) -> Tensor:
+        """See `Replay.latest`."""
+        return self._drawn().latest(count)
+
     def gather(self, split: Split, index: Tensor, length: int) -> Windows:
         """See `Replay.gather`."""
         return self._drawn().gather(split, index, length)

@@ -142,6 +142,11 @@ class Replay(SequenceSource):
         start = (torch.rand(batch_size, generator=draw, dtype=torch.float64) * starts).long()  # (B,)
         return (table.ends - table.lengths)[episode] + start  # a training window begins at every observation
 
+    def latest(self, count: int) -> Tensor:
+        """Give the windows that the newest episodes begin with, the newest first, int64 `(count,)` or fewer."""
+        table = self._require("train")
+        return (table.ends - table.lengths).flip(0)[:count]  # a training window begins at every observation
+
     def gather(self, split: Split, index: Tensor, length: int) -> Windows:
         """Copy windows by index, int64 (B,), from the mapped files."""
         if length < 1:

@@ -81,6 +81,10 @@ class SequenceSource(ABC):
         turn, place = divmod(update, size // batch_size)
         return _order(seed, turn, size)[place * batch_size : (place + 1) * batch_size]  # (B,)
 
+    def latest(self, count: int) -> Tensor:
+        """Give training sequences to look at, those first that were learned from least; int64 `(count,)` or fewer."""
+        return torch.arange(min(count, self.size("train")))
+
 
 @lru_cache(maxsize=2)
 def _order(seed: int, turn: int, size: int) -> Tensor:

@@ -3,6 +3,7 @@
 import itertools
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -12,19 +13,19 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
-from forbes.control.agent import Agent
 from forbes.data import Experience
-from forbes.data.collection import describe_environment, play
+from forbes.data.collection import describe_environment
+from forbes.data.episodes import Episode
+from forbes.envs import Environment
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.record import write_record
-from forbes.seeding import derive_seed
-from forbes.training.acting import ActingModel
+from forbes.training.acting import ActingModel, play_measured
 from forbes.training.loading import load_run
 from forbes.training.provenance import commit
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["evaluate_agents", "is_agent"]
+__all__ = ["evaluate_agents", "is_agent", "loaded_agent", "play_test_episode"]
 
 
 class _Played(NamedTuple):
@@ -85,20 +86,32 @@ def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, 
 
 
 def _play(run: str, episodes: int, seed: int, device: str) -> _Played:
+    with loaded_agent(run, device) as (agent, environment):
+        returns = [play_test_episode(agent, environment, seed, k).total_reward for k in _counted(run, episodes)]
+        return _Played(run, agent, torch.tensor(returns, dtype=torch.float64), describe_environment(environment))
+
+
+@contextmanager
+def loaded_agent(run: str, device: str) -> Iterator[tuple[ActingModel, Environment]]:
+    """Load a run's agent on a device, with its environment, which is closed at the end.
+
+    Raises:
+        ForbesError: where the run is not an agent's.
+    """
     module, data = load_run(run)
     if not isinstance(module, ActingModel) or not isinstance(data.source, Experience):
-        raise ForbesError(f"{run}: not the run of an agent, expected one as the others are. Measure it by itself")
+        kind = type(module).__name__
+        raise ForbesError(f"{run}: not the run of an agent, but of a {kind}. Name an agent's, or measure it by itself")
     module.to(device)
-    choose, returns = module.choose(exploring=False), []
-    environment = data.source.environment
     try:
-        for number in _counted(run, episodes):
-            chance = derive_seed(seed, "test episode", number) % 2**32
-            episode = play(environment, Agent(module.model, choose, chance), chance)
-            returns.append(episode.reward.sum(dtype="float64"))
-        return _Played(run, module, torch.tensor(returns, dtype=torch.float64), describe_environment(environment))
+        yield module, data.source.environment
     finally:
         data.source.close()
+
+
+def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int) -> Episode:
+    """Play an episode of a test, which was not in the training: for every agent, the same seed is the same episode."""
+    return play_measured(agent, environment, "test episode", seed, number)
 
 
 def _counted(run: str, episodes: int) -> Iterator[int]:

@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
@@ -21,7 +20,15 @@ from forbes.errors import ForbesError
 from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.measured import Measured, note, pair
 from forbes.evaluation.record import describe, read_record, write_record
-from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, split_batches
+from forbes.evaluation.runs import (
+    TrainedRun,
+    data_name,
+    data_sha256,
+    find_device,
+    load_runs,
+    require_comparable,
+    split_batches,
+)
 from forbes.evaluation.scoring import PASSES, Parts, Pass, exact_pass, make_pass, score_split
 from forbes.evaluation.tables import print_pairs, print_runs
 from forbes.training.provenance import commit
@@ -76,7 +83,7 @@ def main(argv: Sequence[str]) -> None:
     args = _parser().parse_args(argv)
     command = shlex.join(["forbes", "evaluate", *argv])
     if is_agent(args.runs[0]):
-        return evaluate_agents(args.runs, args.episodes, args.seed, _device(args.device), command)
+        return evaluate_agents(args.runs, args.episodes, args.seed, find_device(args.device), command)
     measured = evaluate(args.runs, args, command)
     print_runs(measured)
     if len(measured) > 1:
@@ -91,7 +98,7 @@ def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
         args: with the options of `add_score_options`.
         command: for the record.
     """
-    runs = load_runs(paths, _device(args.device))
+    runs = load_runs(paths, find_device(args.device))
     jobs = _jobs(args, runs)
     for run in runs:
         read_record(run.path)  # a broken one is said before minutes are spent
@@ -154,18 +161,6 @@ def add_score_options(parser: argparse._ActionsContainer) -> None:
 
 def _all_or_number(text: str) -> int:
     return sys.maxsize if text == "all" else positive(text)
-
-
-def _device(name: str) -> str:
-    """Choose a device, and try it."""
-    chosen = ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
-    try:
-        torch.zeros(1, dtype=torch.float64, device=chosen)
-    # What torch raises for a name it does not know, without CUDA, and where there is no float64.
-    except (RuntimeError, AssertionError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise ForbesError(f"--device {name}: it cannot be used ({reason}). Choose cpu, or auto") from error
-    return chosen
 
 
 def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:

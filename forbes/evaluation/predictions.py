@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
-from forbes.models import BeliefModel
+from forbes.models import BeliefModel, StateSpaceModel
 
-__all__ = ["Completions", "complete", "first_of_each_class", "whole_sequences"]
+__all__ = ["Completions", "complete", "first_of_each_class", "open_loop", "whole_sequences"]
 
 
 class Completions(NamedTuple):
@@ -42,6 +42,24 @@ def complete(model: BeliefModel, batch: SequenceBatch, context: int, samples: in
     action = batch.action[:, context:].repeat(samples, 1, 1)  # (N B, T - context, A)
     output = model.decode(model.imagine(start, action).features)  # (N B, T - context, C, H, W)
     return Completions(model.likelihood.mean(output).unflatten(0, (samples, sequences)), context)
+
+
+@torch.no_grad()
+def open_loop(model: StateSpaceModel, batch: SequenceBatch, context: int) -> Tensor:
+    """Give E[o_t | features] in [0, 1], `(B, T, C, H, W)`, along one trajectory of each sequence.
+
+    Up to `context` the features are the posterior's, which has seen o_t; later ones are the prior's, rolled on from the
+    belief at `context` by the actions that were taken.
+
+    Args:
+        model: on the batch's device.
+        batch: B sequences of T steps, T above `context`.
+        context: steps that the model sees.
+    """
+    filtered = model.filter(model.embed(batch.observation[:, :context]), batch.action[:, :context])
+    imagined = model.imagine(filtered.at(-1), batch.action[:, context:])
+    features = torch.cat((filtered.features, imagined.features), 1)  # (B, T, H + D)
+    return model.likelihood.mean(model.decode(features))
 
 
 def whole_sequences(data: SequenceDataModule, split: Split, index: Tensor) -> SequenceBatch:

@@ -18,7 +18,7 @@ from forbes.models import BeliefModel, ParticleModel, StateSpaceModel, VectorMod
 from forbes.training.loading import load_run
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["TrainedRun", "data_name", "data_sha256", "load_runs", "require_comparable", "split_batches"]
+__all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "require_comparable", "split_batches"]
 
 _FAMILIES: dict[type[nn.Module], str] = {
     GaussianBelief: "RSSM",
@@ -54,6 +54,25 @@ class TrainedRun(NamedTuple):
     def parameters(self) -> int:
         """How many numbers were learned."""
         return sum(parameter.numel() for parameter in self.model.parameters())
+
+
+def find_device(name: str) -> str:
+    """Choose a device, and try it.
+
+    Args:
+        name: "auto", or as torch calls it.
+
+    Raises:
+        ForbesError: where it cannot be used.
+    """
+    chosen = ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+    try:
+        torch.zeros(1, dtype=torch.float64, device=chosen)
+    # What torch raises for a name it does not know, without CUDA, and where there is no float64.
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ForbesError(f"--device {name}: it cannot be used ({reason}). Choose cpu, or auto") from error
+    return chosen
 
 
 def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:

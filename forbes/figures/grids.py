@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
+from forbes.errors import ForbesError
 from forbes.figures.style import BLACK, GREY, PAGE, paper_style
 
-__all__ = ["Bars", "Panel", "draw_panels", "seen_panel", "truth_panel"]
+__all__ = ["Bars", "Panel", "draw_bands", "draw_panels", "require_images", "seen_panel", "truth_panel"]
 
 _GAP = 2  # pixels between the frames of a panel
 _GAP_COLOUR = 0.86
@@ -30,6 +31,8 @@ class Panel(NamedTuple):
     """Of the ink, where the frames are grey."""
     labels: Sequence[str] = ()
     """One for each column, below it."""
+    names: Sequence[str] = ()
+    """One for each row, at its left; in every band, or in none."""
 
 
 class Bars(NamedTuple):
@@ -56,6 +59,13 @@ def seen_panel(observation: Tensor, context: int) -> Panel:
     return Panel("seen", _frames(observation, times), GREY, [f"t={time}" for time in times])
 
 
+def require_images(where: str, shape: Sequence[int], remedy: str) -> None:
+    """Raise a ForbesError, ended by what to do, unless observations of this shape are images, grey or in colours."""
+    if len(shape) != 3 or shape[0] not in (1, 3):
+        found = f"vectors of {shape[0]}" if len(shape) == 1 else f"of shape {tuple(shape)}"
+        raise ForbesError(f"{where}: the observations are {found}, expected images of 1 or 3 channels. {remedy}")
+
+
 def _frames(observation: Tensor, times: Sequence[int]) -> Tensor:
     """Pick steps, counted from 1, and scale what is stored to [0, 1]: `(B, T, C, H, W)` to `(B, K, C, H, W)`."""
     grey = observation.float() / observation.max().clamp(min=1)
@@ -64,25 +74,40 @@ def _frames(observation: Tensor, times: Sequence[int]) -> Tensor:
 
 def draw_panels(panels: Sequence[Panel | Bars], width: float = PAGE) -> Figure:
     """Draw panels of equal rows beside each other, all frames of the same size; the first one has frames."""
-    assert isinstance(panels[0], Panel)
-    rows, height, wide = (panels[0].images.shape[d] for d in (0, 3, 4))
-    margin, title, labels = 0.03, 0.24, 0.18  # inches: left and right, above, below
+    return draw_bands([panels], width)
+
+
+def draw_bands(bands: Sequence[Sequence[Panel | Bars]], width: float = PAGE) -> Figure:
+    """Draw panels beside each other in bands under each other; those of a band have equal rows, all bands columns."""
+    first = [_first(band) for band in bands]
+    height, wide = first[0].images.shape[3:]
+    margin, title, labels, between = 0.03, 0.24, 0.18, 0.07  # inches: left and right, above, below, under a band
+    names = 0.5 if first[0].names else 0.0  # inches, at the left
     space = 0.7  # between panels, in frames
-    columns = [panel.images.shape[1] if isinstance(panel, Panel) else _BARS_COLUMNS for panel in panels]
-    cell = (width - 2 * margin) / (sum(columns) + space * (len(panels) - 1))  # inches
-    tall = rows * cell * height / wide
-    total = title + tall + labels
+    columns = [panel.images.shape[1] if isinstance(panel, Panel) else _BARS_COLUMNS for panel in bands[0]]
+    cell = (width - 2 * margin - names) / (sum(columns) + space * (len(columns) - 1))  # inches
+    talls = [panel.images.shape[0] * cell * height / wide for panel in first]  # inches
+    total = title + sum(talls) + between * (len(bands) - 1) + labels
     with paper_style():
         figure = Figure((width, total))
-        left = margin
-        for panel, count in zip(panels, columns, strict=True):
-            axes = figure.add_axes((left / width, labels / total, count * cell / width, tall / total))
-            if isinstance(panel, Panel):
-                _draw_panel(axes, panel)
-            else:
-                _draw_bars(axes, panel)
-            left += (count + space) * cell
+        bottom = total - title
+        for band, tall in zip(bands, talls, strict=True):
+            bottom, left = bottom - tall, margin + names
+            for panel, count in zip(band, columns, strict=True):
+                axes = figure.add_axes((left / width, bottom / total, count * cell / width, tall / total))
+                if isinstance(panel, Panel):
+                    _draw_panel(axes, panel)
+                else:
+                    _draw_bars(axes, panel)
+                left += (count + space) * cell
+            bottom -= between
     return figure
+
+
+def _first(band: Sequence[Panel | Bars]) -> Panel:
+    """Give the first panel of a band, which has frames."""
+    assert isinstance(band[0], Panel)
+    return band[0]
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:
@@ -91,7 +116,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set_title(panel.title, color=panel.colour, pad=4)
     axes.set_xticks([width * k + width / 2 for k in range(len(panel.labels))], panel.labels, fontsize=6, color=GREY)
     axes.tick_params(length=0, pad=2)
-    axes.set_yticks([])
+    tall = panel.images.shape[-2] + _GAP
+    axes.set_yticks([tall * r + tall / 2 for r in range(len(panel.names))], panel.names, fontsize=6, color=GREY)
     axes.grid(False)
     axes.spines[:].set_visible(False)
 

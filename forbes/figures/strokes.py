@@ -12,7 +12,7 @@ from forbes.data import SequenceBatch, SequenceDataModule, Strokes
 from forbes.evaluation.neighbours import Beginnings, last_frame
 from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
-from forbes.figures.style import COLUMN, paper_style, show_settled
+from forbes.figures.style import COLUMN, draw_range, paper_style, show_settled
 from forbes.models import BeliefModel
 
 __all__ = ["Family", "ambiguous_digits", "elbo_against_updates", "predictions"]
@@ -65,11 +65,10 @@ def elbo_against_updates(families: Sequence[Family]) -> Figure:
         axes = figure.subplots()
         for family, bound in zip(families, bounds, strict=True):
             table = pd.concat(family.curves, axis=1).dropna()  # updates that all runs have
-            mean, runs = table.mean(axis=1), len(family.curves)
+            runs = len(family.curves)
             label = family.name if runs == 1 else f"{family.name}, {runs} runs"
             label += f", {bound}" if len(set(bounds)) > 1 else ""
-            axes.fill_between(table.index, table.min(axis=1), table.max(axis=1), color=family.colour, alpha=0.2, lw=0)
-            axes.plot(table.index, mean, color=family.colour, label=label)
+            draw_range(axes, table, family.colour, label)
             if family.tests:
                 test = sum(family.tests) / len(family.tests)
                 (end,) = axes.plot(table.index.max(), test, "D", color=family.colour, markersize=5, zorder=3)

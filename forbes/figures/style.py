@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from forbes.files import replace_file
 
-__all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "density_map", "paper_style"]
-__all__ += ["save_figure", "show_settled"]
+__all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "density_map", "draw_range"]
+__all__ += ["paper_style", "save_figure", "show_settled"]
 
 COLUMN, PAGE = 3.3, 6.9
 """Widths in inches: one column and the whole page."""
@@ -69,6 +69,12 @@ def save_figure(figure: Figure, path: Path) -> None:
 def density_map(colour: str) -> LinearSegmentedColormap:
     """Give a colour map from white to a colour."""
     return LinearSegmentedColormap.from_list("density", ["white", colour])
+
+
+def draw_range(axes: Axes, runs: pd.DataFrame, colour: str, label: str) -> None:
+    """Draw mean and range of several runs, a column each, against the index."""
+    axes.fill_between(runs.index, runs.min(axis=1), runs.max(axis=1), color=colour, alpha=0.2, lw=0)
+    axes.plot(runs.index, runs.mean(axis=1), color=colour, label=label)
 
 
 def show_settled(axes: Axes, curves: Sequence[pd.Series]) -> None:

@@ -26,6 +26,10 @@ class Likelihood(ABC):
     def mean(self, output: Tensor) -> Tensor:
         """Give E[o | output], for pictures as a grey value in [0, 1]; shape of `output`."""
 
+    def picture(self, observation: Tensor) -> Tensor:
+        """Give a stored observation in the units of `mean`."""
+        return self.target(observation)
+
     @abstractmethod
     def sample(self, output: Tensor) -> Tensor:
         """Draw an observation as `target` would give it; shape of `output`."""
@@ -91,6 +95,10 @@ class Normal(Likelihood):
     def mean(self, output: Tensor) -> Tensor:
         """See `Likelihood.mean`."""
         return (output + 0.5).clamp(0, 1)
+
+    def picture(self, observation: Tensor) -> Tensor:
+        """See `Likelihood.picture`."""
+        return observation.float() / self.scale
 
     def sample(self, output: Tensor) -> Tensor:
         """See `Likelihood.sample`."""

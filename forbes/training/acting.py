@@ -11,13 +11,16 @@ from torch import Tensor
 from forbes.control.agent import Agent, Choice
 from forbes.control.policy import ScalarHead
 from forbes.data import SequenceBatch
+from forbes.data.collection import play
+from forbes.data.episodes import Episode
 from forbes.envs import Environment
 from forbes.errors import ForbesError
 from forbes.models import Filtered, StateSpaceModel
 from forbes.models.elbo import ElboTerms
+from forbes.seeding import derive_seed
 from forbes.training.world_model import WorldModel, require_at_least
 
-__all__ = ["Acting", "ActingModel"]
+__all__ = ["Acting", "ActingModel", "play_measured"]
 
 
 class ActingModel(WorldModel, ABC):
@@ -91,3 +94,17 @@ class Acting:
     def __call__(self, environment: Environment, seed: int) -> Agent:
         """See `MakePolicy`."""
         return Agent(self.agent.model, self.agent.choose(self.exploring), seed)
+
+
+def play_measured(agent: ActingModel, environment: Environment, purpose: str, seed: int, number: int) -> Episode:
+    """Play an episode without exploration; it is a function of purpose, seed, number and the weights.
+
+    Args:
+        agent: in eval mode.
+        environment: that it acts in.
+        purpose: keeps these episodes apart from all others of the same seed.
+        seed: of the measurement.
+        number: of the episode.
+    """
+    chance = derive_seed(seed, purpose, number) % 2**32
+    return play(environment, Acting(agent, exploring=False)(environment, chance), chance)

@@ -121,7 +121,7 @@ def test_drawing_leaves_random_state_and_module_as_they_were(callback, tiny_run,
     assert is_picture(tmp_path / "figures" / callback.filename)
 
 
-def test_draws_after_every_kth_validation_and_at_the_end(tiny_config, callbacks, tmp_path, monkeypatch):
+def test_draws_after_every_kth_epoch_and_at_the_end(tiny_config, callbacks, tmp_path, monkeypatch):
     drawn = []
     for callback in (PredictionGrid, ElboCurve, BeliefPlot):
 
@@ -132,8 +132,8 @@ def test_draws_after_every_kth_validation_and_at_the_end(tiny_config, callbacks,
         monkeypatch.setattr(callback, "draw", note)
     configs = ["--config", str(tiny_config), "--config", str(callbacks)]
     main(["fit", *configs, "--run_dir", str(tmp_path), "--trainer.max_epochs", "3"])
-    assert [epoch for callback, epoch in drawn if callback is PredictionGrid] == [0, 1, 2]  # not again at the end
-    assert [epoch for callback, epoch in drawn if callback is ElboCurve] == [1, 3]  # every 2, and the end
+    assert [epoch for callback, epoch in drawn if callback is PredictionGrid] == [1, 2, 3]  # epochs done
+    assert [epoch for callback, epoch in drawn if callback is ElboCurve] == [2, 3]  # every 2, and the end
 
 
 def test_the_curve_of_a_resumed_run_starts_at_the_first_life(watched, tmp_path):

@@ -3,8 +3,13 @@
 from forbes.training.callbacks.belief_plot import BeliefPlot
 from forbes.training.callbacks.collect import Collect
 from forbes.training.callbacks.elbo_curve import ElboCurve
+from forbes.training.callbacks.episode_video import EpisodeVideo
+from forbes.training.callbacks.imagined_futures import ImaginedFutures
+from forbes.training.callbacks.open_loop_panel import OpenLoopPanel
 from forbes.training.callbacks.parameter_count import ParameterCount
 from forbes.training.callbacks.picture import PictureCallback
 from forbes.training.callbacks.prediction_grid import PredictionGrid
+from forbes.training.callbacks.return_curve import ReturnCurve
 
-__all__ = ["BeliefPlot", "Collect", "ElboCurve", "ParameterCount", "PictureCallback", "PredictionGrid"]
+__all__ = ["BeliefPlot", "Collect", "ElboCurve", "EpisodeVideo", "ImaginedFutures", "OpenLoopPanel", "ParameterCount"]
+__all__ += ["PictureCallback", "PredictionGrid", "ReturnCurve"]

@@ -16,7 +16,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.predictions import first_of_each_class
 from forbes.figures.style import BLACK, BLUE, GREY, ORANGE, PAGE, density_map, paper_style
 from forbes.models import StateSpaceModel
-from forbes.training.callbacks.picture import PictureCallback, to_device
+from forbes.training.callbacks.picture import PictureCallback, require_state, to_device
 from forbes.training.world_model import WorldModel
 
 __all__ = ["BeliefPlot"]
@@ -37,7 +37,7 @@ class BeliefPlot(PictureCallback):
         digits: how many, the first of each class of the validation split.
         columns: steps, evenly from the first to the last.
         samples: of each belief.
-        every: draw after every k-th validation.
+        every: draw after every k-th epoch.
     """
 
     filename = "beliefs.png"
@@ -51,8 +51,7 @@ class BeliefPlot(PictureCallback):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Refuse a model without a state, before hours are spent."""
-        if not isinstance(model := pl_module.model, StateSpaceModel):
-            raise ForbesError(f"BeliefPlot: {type(model).__name__} has no state to plot. Leave this callback out")
+        require_state(self, pl_module)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """See `PictureCallback`."""

@@ -8,12 +8,12 @@ from typing import cast
 from lightning import Callback, LightningModule, Trainer
 
 from forbes.data import Experience
-from forbes.data.collection import MakePolicy, play, random_policy
+from forbes.data.collection import random_policy
+from forbes.data.episodes import Episode
 from forbes.errors import ForbesError
-from forbes.seeding import derive_seed
-from forbes.training.acting import Acting, ActingModel
+from forbes.training.acting import Acting, ActingModel, play_measured
 
-__all__ = ["Collect"]
+__all__ = ["Collect", "evaluation_episode", "require_agent"]
 
 
 class Collect(Callback):
@@ -57,7 +57,7 @@ class Collect(Callback):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open the store, before a checkpoint says how far it had come."""
-        _require_agent(trainer, pl_module)
+        require_agent(self, trainer, pl_module)
         if stage == "fit":
             _experience(trainer).open(Path(trainer.default_root_dir) / "episodes")
 
@@ -75,9 +75,9 @@ class Collect(Callback):
         source, agent = _experience(trainer), cast(ActingModel, pl_module)
         for record in source.collect(self.seed_episodes, random_policy, "random", self.seed):
             _say(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
-        with _acting(agent, exploring=True) as make_policy:
+        with _eval_mode(agent):
             until = self.seed_episodes + trainer.current_epoch
-            list(source.collect(until, make_policy, type(agent).__name__, self.seed))
+            list(source.collect(until, Acting(agent, exploring=True), type(agent).__name__, self.seed))
         if self.overlap:
             source.begin(Acting.as_it_is(agent, exploring=True), self.seed)
         steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
@@ -93,21 +93,21 @@ class Collect(Callback):
         number = trainer.current_epoch + 1
         if number % self.evaluate_every and number != trainer.max_epochs:
             return
-        environment = source.environment
-        returns = []
-        with _acting(agent, exploring=False) as make_policy:
-            for place in range(self.evaluation_episodes):
-                chance = derive_seed(self.seed, "evaluation", place) % 2**32
-                returns.append(play(environment, make_policy(environment, chance), chance).reward.sum(dtype="float64"))
-        agent.log("return/acting", sum(returns) / len(returns), batch_size=1)
+        with _eval_mode(agent):
+            played = [evaluation_episode(trainer, agent, self.seed, k) for k in range(self.evaluation_episodes)]
+        agent.log("return/acting", sum(episode.total_reward for episode in played) / len(played), batch_size=1)
+
+
+def evaluation_episode(trainer: Trainer, agent: ActingModel, seed: int, number: int) -> Episode:
+    """Play one of the episodes that measure an agent, in eval mode, while it learns: they are the same each time."""
+    return play_measured(agent, _experience(trainer).environment, "evaluation", seed, number)
 
 
 @contextmanager
-def _acting(agent: ActingModel, exploring: bool) -> Iterator[MakePolicy]:
-    """Give what makes the agent's policy for an episode, in eval mode."""
+def _eval_mode(agent: ActingModel) -> Iterator[None]:
     training = agent.training
     agent.eval()
-    yield Acting(agent, exploring)
+    yield
     agent.train(training)
 
 
@@ -116,11 +116,12 @@ def _experience(trainer: Trainer) -> Experience:
     return source
 
 
-def _require_agent(trainer: Trainer, module: LightningModule) -> None:
+def require_agent(callback: Callback, trainer: Trainer, module: LightningModule) -> None:
+    """Raise a ForbesError unless an agent learns on Experience."""
     source = trainer.datamodule.source  # type: ignore[attr-defined]
     if not (isinstance(source, Experience) and isinstance(module, ActingModel)):
-        found = f"{type(module).__name__} on {type(source).__name__}"
-        raise ForbesError(f"Collect: found a {found}, expected an agent on Experience. Leave it out, or change them")
+        name, found = type(callback).__name__, f"{type(module).__name__} on {type(source).__name__}"
+        raise ForbesError(f"{name}: found a {found}, expected an agent on Experience. Leave it out, or change them")
 
 
 def _say(trainer: Trainer, line: str) -> None:

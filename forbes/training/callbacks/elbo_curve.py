@@ -26,7 +26,7 @@ class ElboCurve(PictureCallback):
 
     Args:
         sequences: of the validation split, for the KL at each step.
-        every: draw after every k-th validation.
+        every: draw after every k-th epoch.
     """
 
     filename = "elbo.png"

@@ -12,54 +12,75 @@ from matplotlib.figure import Figure
 
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.errors import ForbesError
+from forbes.evaluation.predictions import first_of_each_class
+from forbes.figures.grids import require_images
 from forbes.figures.style import save_figure
+from forbes.models import StateSpaceModel
 from forbes.seeding import derive_seed
 from forbes.training.world_model import WorldModel
 
-__all__ = ["PictureCallback", "to_device"]
+__all__ = [
+    "FileCallback",
+    "PictureCallback",
+    "require_context",
+    "require_frames",
+    "require_state",
+    "shown_sequences",
+    "to_device",
+]
 
 
-class PictureCallback(Callback, ABC):
-    """Draws a picture into the run's `figures/`, anew after every k-th validation and at the end of the fit.
+class FileCallback(Callback, ABC):
+    """Leaves a file in the run's `figures/`, anew after every k-th epoch and at the end of the fit.
 
-    A training with it is bitwise the same as one without: it draws with random numbers of its own.
+    A training with it is bitwise the same as one without: it has random numbers of its own. An epoch's file is made
+    when the next one begins, so that all the epoch's metrics are there.
 
     Args:
         every: k.
     """
 
     filename: str
-    """Of the picture."""
+    """Of the file."""
 
     def __init__(self, every: int = 5) -> None:
         if every < 1:
             raise ForbesError(f"{type(self).__name__}: every is {every}, expected at least 1.")
         self.every = every
-        self._drawn_at = -1
 
     @abstractmethod
-    def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
-        """Draw, without gradients, on the module's device."""
+    def write(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule, path: Path) -> None:
+        """Write the file, without gradients, in eval mode, on the module's device."""
 
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw after every k-th validation of a fit."""
-        fitting = trainer.state.fn == "fit" and not trainer.sanity_checking
-        if fitting and (trainer.current_epoch + 1) % self.every == 0:
-            self._save(trainer, pl_module)
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Show the model after every k-th epoch."""
+        if trainer.current_epoch > 0 and trainer.current_epoch % self.every == 0:
+            self._write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the finished model."""
-        self._save(trainer, pl_module)
+        """Show the finished model."""
+        self._write(trainer, pl_module)
 
-    def _save(self, trainer: Trainer, module: LightningModule) -> None:
+    def _write(self, trainer: Trainer, module: LightningModule) -> None:
         folder = trainer.log_dir  # asks every process, so every process must ask
-        if folder is None or not trainer.is_global_zero or self._drawn_at == trainer.global_step:
+        if folder is None or not trainer.is_global_zero:
             return
         with _own_randomness(module, self.filename):
             # Lightning gives `trainer.datamodule` no type, and every hook a LightningModule.
-            figure = self.draw(trainer, cast(WorldModel, module), trainer.datamodule)  # type: ignore[attr-defined]
-        save_figure(figure, Path(folder) / "figures" / self.filename)
-        self._drawn_at = trainer.global_step
+            data = trainer.datamodule  # type: ignore[attr-defined]
+            self.write(trainer, cast(WorldModel, module), data, Path(folder) / "figures" / self.filename)
+
+
+class PictureCallback(FileCallback):
+    """A `FileCallback` whose file is a picture."""
+
+    @abstractmethod
+    def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
+        """Draw, without gradients, in eval mode, on the module's device."""
+
+    def write(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule, path: Path) -> None:
+        """See `FileCallback`."""
+        save_figure(self.draw(trainer, module, data), path)
 
 
 @contextmanager
@@ -77,3 +98,38 @@ def _own_randomness(module: LightningModule, purpose: str) -> Iterator[None]:
 def to_device(batch: SequenceBatch, module: LightningModule) -> SequenceBatch:
     """Move a batch to where the module is."""
     return SequenceBatch(*(values.to(module.device) for values in batch))
+
+
+def shown_sequences(data: SequenceDataModule, count: int, module: LightningModule) -> SequenceBatch:
+    """Give sequences that no model has a say in, where the module is.
+
+    They are the first of each class of the validation split. An agent's experience has no such split: then they are the
+    beginnings of the newest episodes, which it has learned from least, or not yet where `Collect` comes before.
+    """
+    if data.source.size("validation"):
+        batch = data.sequences("validation", first_of_each_class(data, "validation", count))
+    else:
+        batch = data.sequences("train", data.source.latest(count))
+    return to_device(batch, module)
+
+
+def require_context(callback: Callback, trainer: Trainer, context: int) -> None:
+    """Raise a ForbesError unless a context leaves something to predict, before hours are spent."""
+    length = trainer.datamodule.length  # type: ignore[attr-defined]  # Lightning gives it no type
+    if context >= length:
+        name = type(callback).__name__
+        raise ForbesError(f"{name}: context is {context}, expected less than the length {length}. Choose a smaller one")
+
+
+def require_state(callback: Callback, module: LightningModule) -> None:
+    """Raise a ForbesError for a model without a state."""
+    if not isinstance(model := module.model, StateSpaceModel):
+        raise ForbesError(
+            f"{type(callback).__name__}: {type(model).__name__} has no state to plot. Leave this callback out"
+        )
+
+
+def require_frames(callback: Callback, trainer: Trainer) -> None:
+    """Raise a ForbesError unless the observations are images."""
+    shape = trainer.datamodule.observation_shape  # type: ignore[attr-defined]
+    require_images(type(callback).__name__, shape, "Leave this callback out, or observe pixels")

@@ -8,7 +8,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import BLUE
-from forbes.training.callbacks.picture import PictureCallback, to_device
+from forbes.training.callbacks.picture import PictureCallback, require_context, to_device
 from forbes.training.world_model import WorldModel
 
 __all__ = ["PredictionGrid"]
@@ -24,7 +24,7 @@ class PredictionGrid(PictureCallback):
         digits: rows.
         samples: N.
         context: frames that the model sees.
-        every: draw after every k-th validation.
+        every: draw after every k-th epoch.
     """
 
     filename = "predictions.png"
@@ -38,9 +38,7 @@ class PredictionGrid(PictureCallback):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Refuse a context that leaves nothing to predict, before hours are spent."""
-        length = trainer.datamodule.length  # type: ignore[attr-defined]  # Lightning gives it no type
-        if self.context >= length:
-            raise ForbesError(f"PredictionGrid: context is {self.context}, expected less than the length {length}.")
+        require_context(self, trainer, self.context)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """See `PictureCallback`."""

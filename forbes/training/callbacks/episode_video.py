@@ -1,0 +1,44 @@
+"""An agent in an episode, as a video."""
+
+from pathlib import Path
+from typing import cast
+
+from lightning import LightningModule, Trainer
+
+from forbes.data import SequenceDataModule
+from forbes.figures.video import gif
+from forbes.files import replace_file
+from forbes.training.acting import ActingModel
+from forbes.training.callbacks.collect import evaluation_episode, require_agent
+from forbes.training.callbacks.picture import FileCallback, require_frames
+from forbes.training.world_model import WorldModel
+
+__all__ = ["EpisodeVideo"]
+
+
+class EpisodeVideo(FileCallback):
+    """Writes `figures/episode.gif`: an episode without exploration, the first of those that `Collect` measures by.
+
+    Args:
+        seed: that of `Collect`.
+        every: play after every k-th epoch.
+
+    Raises:
+        ForbesError: in a fit, where no agent learns, or the observations are not images.
+    """
+
+    filename = "episode.gif"
+
+    def __init__(self, seed: int = 0, every: int = 10) -> None:
+        super().__init__(every)
+        self.seed = seed
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Refuse what cannot be filmed, before hours are spent."""
+        require_agent(self, trainer, pl_module)
+        require_frames(self, trainer)
+
+    def write(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule, path: Path) -> None:
+        """See `FileCallback`."""
+        episode = evaluation_episode(trainer, cast(ActingModel, module), self.seed, 0)
+        replace_file(path, gif([episode.observation]))
