@@ -93,14 +93,14 @@ def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, pred
         number: of trajectories.
         predict: whether to draw the one-step predictions too.
     """
-    embedding = model.embed(batch.observation)  # (B, T, E)
-    target = model.likelihood.target(batch.observation).flatten(0, 1)  # (B T, *O)
+    seen = model.see(batch.observation, batch.action)  # once: coarse pixels have noise, the same for both networks
+    target = seen.target.flatten(0, 1)  # (B T, *O)
 
     def log_prob(features: Tensor) -> Tensor:
         return frame_log_prob(model, features.flatten(0, 1), target).view(batch.mask.shape)  # (B, T)
 
     for _ in range(number):
-        filtered = model.filter(embedding, batch.action)
+        filtered = model.filter(seen.embedding, seen.action)
         kl = filtered.log_prob - model.prior_log_prob(filtered)
         prediction = log_prob(model.predict(filtered)) if predict else None
         yield Trajectory(log_prob(filtered.features), kl.double(), prediction)

@@ -121,6 +121,25 @@ def test_its_samples_are_estimates_of_the_bound_that_is_trained(belief):
         torch.testing.assert_close(trajectory.kl, terms.kl)
 
 
+class Grainy(Normal):
+    """Each reading of a frame has noise of its own, as with fewer bits."""
+
+    def target(self, observation):
+        return super().target(observation) + torch.rand(observation.shape, dtype=torch.float64)
+
+
+def test_encoder_and_likelihood_share_one_reading_of_a_frame():
+    model, batch = make_model(GaussianBelief, Grainy(scale=1.0)), make_batch()
+    with torch.no_grad():
+        torch.manual_seed(3)
+        (trajectory,) = trajectories(model, batch, 1, predict=False)
+        torch.manual_seed(3)
+        terms = model.elbo(batch.observation, batch.action, batch.mask)
+
+    torch.testing.assert_close(trajectory.reconstruction, terms.reconstruction)
+    torch.testing.assert_close(trajectory.kl, terms.kl)
+
+
 def test_the_fivo_bound_is_the_one_that_particles_are_trained_by():
     model, batch = make_model(GaussianBelief, build=partial(ParticleModel, particles=5)), make_batch()
     torch.manual_seed(3)
