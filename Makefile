@@ -18,7 +18,7 @@ compare: .venv/installed
 	$(BIN)/forbes figures strokes --runs runs/compare/forbes-0 runs/compare/rssm-0 -o runs/compare/figures
 
 test: .venv/installed-dev
-	$(BIN)/pytest -q
+	$(BIN)/pytest -q -n auto --maxprocesses 4
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
