@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from forbes.models import Filtered, State, StateSpaceModel
+from forbes.precision import full_precision
 
 __all__ = ["belief_samples", "frozen"]
 
@@ -25,19 +26,26 @@ def belief_samples(model: StateSpaceModel, filtered: Filtered, number: int) -> S
 
     The first is the filter's own trajectory, so that N = 1 is Dreamer.
     """
-    more, _ = model.posterior.rsample(filtered.context, (number - 1,))  # (N - 1, B, T, D)
+    with full_precision(filtered.context):
+        more, _ = model.posterior.rsample(filtered.context, (number - 1,))  # (N - 1, B, T, D)
     state = torch.cat((filtered.state[None], more)).detach()  # (N, B, T, D)
     return State(filtered.hidden.detach().expand(number, -1, -1, -1), state)
 
 
 @contextmanager
 def frozen(*modules: nn.Module) -> Iterator[None]:
-    """Build a graph through modules that leaves their parameters out; `no_grad` would cut the path to the actions."""
-    parameters = [parameter for module in modules for parameter in module.parameters() if parameter.requires_grad]
-    for parameter in parameters:
-        parameter.requires_grad_(False)
+    """Build a graph through modules that leaves their parameters out; `no_grad` would cut the path to the actions.
+
+    Stand-ins that share their memory take the parameters' places: the compiler cannot follow `requires_grad_`.
+    """
+    held = [(part, dict(part._parameters)) for module in modules for part in module.modules()]
+    for part, parameters in held:
+        constants = {
+            name: parameter if parameter is None else parameter.detach() for name, parameter in parameters.items()
+        }
+        part._parameters.update(constants)  # type: ignore[arg-type]
     try:
         yield
     finally:
-        for parameter in parameters:
-            parameter.requires_grad_(True)
+        for part, parameters in held:
+            part._parameters.update(parameters)

@@ -83,5 +83,5 @@ class ScalarHead(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Give the number, `(*, F)` to `(*)`."""
-        number: Tensor = self.net(features)
+        number: Tensor = self.net(features).to(features.dtype)
         return number.squeeze(-1)  # (*)

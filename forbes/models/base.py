@@ -149,7 +149,7 @@ class BeliefModel(nn.Module, ABC):
 
     def encode(self, target: Tensor) -> Tensor:
         """Encode every frame as `Likelihood.target` or `Likelihood.sample` gives it: `(B, T, *O)` to e `(B, T, E)`."""
-        embedding: Tensor = self.encoder(target.flatten(0, 1))  # (B T, E)
+        embedding: Tensor = self.encoder(target.flatten(0, 1)).to(target.dtype)  # (B T, E)
         return embedding.view(*target.shape[:2], -1)  # (B, T, E)
 
     def decode(self, features: Tensor) -> Tensor:

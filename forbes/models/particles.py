@@ -27,6 +27,7 @@ from forbes.models.elbo import ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder
 from forbes.models.state_space import StateSpaceModel
+from forbes.precision import full_precision
 
 __all__ = ["ParticleModel", "Particles", "effective_sample_size", "run_particles", "soft", "systematic"]
 __all__ += ["systematic_resampling"]
@@ -122,10 +123,12 @@ def run_particles(
     sequences, steps = seen.embedding.shape[:2]
     stay = torch.arange(number, device=seen.embedding.device)[:, None].expand(-1, sequences)  # (K, B)
     log_before = torch.full(stay.shape, -math.log(number), dtype=dtype, device=stay.device)
-    step = model.bind(seen.embedding, seen.action, number)
+    with full_precision(seen.embedding):
+        step = model.bind(seen.embedding, seen.action, number)
     carried = model.initial(number * sequences)
     for t in range(steps):
-        moved = step(carried)
+        with full_precision(seen.embedding):
+            moved = step(carried)
         features = moved.features.view(*stay.shape, -1)  # (K, B, H + D)
         reconstruction = log_likelihood(features, seen.target[:, t])
         divergence = (moved.log_prob - model.prior_log_prob(moved)).view(stay.shape)  # (K, B)

@@ -23,6 +23,7 @@ from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
 from forbes.models.elbo import ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, bind_gru, perceptron
+from forbes.precision import full_precision
 
 __all__ = ["Filtered", "StateSpaceModel"]
 
@@ -135,17 +136,19 @@ class StateSpaceModel(BeliefModel):
             One trajectory of (h_t, s_t) per sequence. A prefix of the input gives the prefix of the output (for
             the same noise): nothing looks ahead.
         """
-        step = self.bind(embedding, action)
         state = start or self.initial(len(embedding))
         steps: list[Filtered] = []
-        for _ in range(embedding.shape[1]):
-            steps.append(step(state))
-            state = State(steps[-1].hidden, steps[-1].state)
+        with full_precision(embedding):
+            step = self.bind(embedding, action)
+            for _ in range(embedding.shape[1]):
+                steps.append(step(state))
+                state = State(steps[-1].hidden, steps[-1].state)
         return Filtered(*(torch.stack(values, 1) for values in zip(*steps, strict=True)))  # (B, T, ...)
 
     def prior_log_prob(self, filtered: Filtered) -> Tensor:
         """Give log p(s_t | h_t) of the posterior's samples in nats, `(B, T)`."""
-        return self.prior.log_prob(filtered.state, self.prior_context(filtered.hidden))
+        with full_precision(filtered.state):
+            return self.prior.log_prob(filtered.state, self.prior_context(filtered.hidden))
 
     def imagine(self, start: State, action: Tensor) -> Rollout:
         """See `BeliefModel.imagine`: rolls the prior on."""
@@ -164,13 +167,14 @@ class StateSpaceModel(BeliefModel):
             T steps after `start`, which itself is not among them.
         """
         hidden, state = start
-        sample = self.prior.sampler(Loop(steps, len(state)))
         made: list[tuple[Tensor, Tensor, Tensor]] = []
-        for _ in range(steps):
-            action = policy(torch.cat((hidden, state), -1))
-            hidden = self.gru(self.transition(torch.cat((state, action), -1)), hidden)
-            state, log_prob = sample(self.prior_context(hidden))
-            made.append((hidden, state, log_prob))
+        with full_precision(state):
+            sample = self.prior.sampler(Loop(steps, len(state)))
+            for _ in range(steps):
+                action = policy(torch.cat((hidden, state), -1))
+                hidden = self.gru(self.transition(torch.cat((state, action), -1)), hidden)
+                state, log_prob = sample(self.prior_context(hidden))
+                made.append((hidden, state, log_prob))
         return Rollout(*(torch.stack(values, 1) for values in zip(*made, strict=True)))  # (B, T, ...)
 
     def beliefs(self, seen: Seen, samples: int) -> State:
@@ -194,13 +198,12 @@ class StateSpaceModel(BeliefModel):
 
     def bound(self, filtered: Filtered, seen: Seen, mask: Tensor) -> ElboTerms:
         """Estimate the bound with the posterior trajectory that `filter` has drawn for what was seen."""
-        prior_context = self.prior_context(filtered.hidden)  # (B, T, C)
-        return ElboTerms(
-            reconstruction=self.log_likelihood(filtered.features, seen.target),
-            kl=filtered.log_prob - self.prior.log_prob(filtered.state, prior_context),
-            analytic_kl=self.posterior.kl(filtered.context, self.prior, prior_context),
-            mask=mask,
-        )
+        reconstruction = self.log_likelihood(filtered.features, seen.target)
+        with full_precision(filtered.state):
+            prior_context = self.prior_context(filtered.hidden)  # (B, T, C)
+            kl = filtered.log_prob - self.prior.log_prob(filtered.state, prior_context)
+            analytic_kl = self.posterior.kl(filtered.context, self.prior, prior_context)
+        return ElboTerms(reconstruction, kl, analytic_kl, mask)
 
     @staticmethod
     def _bind(network: nn.Sequential, known: Tensor, loop: Loop) -> Affine:

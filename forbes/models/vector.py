@@ -22,6 +22,7 @@ from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
 from forbes.models.elbo import ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, bind_gru
+from forbes.precision import full_precision
 
 __all__ = ["VectorModel"]
 
@@ -125,12 +126,13 @@ class VectorModel(BeliefModel):
 
     def _run(self, hidden: Tensor, embedding: Tensor, action: Tensor) -> Tensor:
         """Give h after each (e, a), `(B, T, H)`: all inputs are known, so the loop holds the GRU only."""
-        moves = self.transition(torch.cat((embedding, action), -1))  # (B, T, M)
-        gru = bind_gru(self.gru, Loop(moves.shape[1], len(moves)))
         steps: list[Tensor] = []
-        for move in moves.unbind(1):
-            hidden = gru(move, hidden)
-            steps.append(hidden)
+        with full_precision(embedding):
+            moves = self.transition(torch.cat((embedding, action), -1))  # (B, T, M)
+            gru = bind_gru(self.gru, Loop(moves.shape[1], len(moves)))
+            for move in moves.unbind(1):
+                hidden = gru(move, hidden)
+                steps.append(hidden)
         return torch.stack(steps, 1)  # (B, T, H)
 
     def _overshoot(self, hidden: Tensor, seen: Seen, mask: Tensor) -> Tensor:

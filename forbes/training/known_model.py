@@ -17,6 +17,7 @@ from forbes.models.known_model import KnownModel, Units
 from forbes.pomdps import CategoricalBelief, Process
 from forbes.pomdps.base import require_positive
 from forbes.pomdps.distributions import PointMass
+from forbes.precision import full_precision
 from forbes.seeding import derive_seed, generator
 
 __all__ = ["KnownBelief", "Objective", "has_transition_density"]
@@ -100,13 +101,15 @@ class KnownBelief(LightningModule):
 
     def state_nll(self, batch: SequenceBatch) -> Tensor:
         """Give -log q(s_t | o_1:t) of the true states in nats, `(B, T)`."""
-        return -self.model.belief(batch.observation, batch.action).log_prob(batch.state)
+        with full_precision(batch.state):
+            return -self.model.belief(batch.observation, batch.action).log_prob(batch.state)
 
     def loss(self, batch: SequenceBatch) -> Tensor:
         """Give the objective in nats per step, a scalar."""
-        if self.objective == "elbo":
+        if self.objective == "state_nll":
+            return self.state_nll(batch).mean()
+        with full_precision(batch.state):
             return elbo_loss(self.model.elbo(batch.observation, batch.action, batch.mask))
-        return self.state_nll(batch).mean()
 
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
         """Seed the noise of this update, so that a resumed run draws the same."""
