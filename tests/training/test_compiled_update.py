@@ -37,7 +37,6 @@ def agent_fixture(request):
         trajectories=2,
         horizon=2,
         control_dim=8,
-        control_layers=1,
         belief=request.param,
         encoder=partial(MLPEncoder, width=8, layers=1),
         decoder=partial(MLPDecoder, width=8, layers=1),
