@@ -6,6 +6,7 @@ from itertools import cycle
 
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from forbes.errors import ForbesError
 from forbes.figures.style import COLUMN, GREY, ORANGE, PALETTE, draw_range, paper_style
@@ -31,9 +32,11 @@ def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Seque
             seeds = pd.concat(curves, axis=1).interpolate("index", limit_area="inside").dropna()
             draw_range(axes, seeds, colour, f"{method}, published, {len(curves)} seeds")
         axes.plot(exploring.index, exploring, color=GREY, lw=0.6, label="exploring")
-        axes.plot(acting.index, acting, ".-", color=PALETTE[0], label="acting, without exploration")
+        axes.plot(acting.index, acting, ".-", color=PALETTE[0], markersize=3, label="acting, without exploration")
         axes.set(xlabel="env steps (frames)", ylabel="return of an episode", title=task)
         axes.set_xlim(0, 1.02 * table.index.max())
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
+        axes.locator_params("x", nbins=6)
         axes.legend(loc="best")
     return figure
 
