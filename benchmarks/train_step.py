@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from forbes.beliefs import FlowBelief, GaussianBelief
-from forbes.data import SequenceBatch
+from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.models import elbo_loss
 from forbes.training import WorldModel
 from forbes.training.configuration import allow_modules, experiment_parser
@@ -38,14 +38,19 @@ ACTIONS = 6  # of cheetah-run
 TOLERANCE = 1e-4  # relative, between the losses of ours and the textbook form
 
 
-def strokes(form: str) -> tuple[WorldModel, SequenceBatch]:
-    """Build the default experiment on digit strokes and its first batch."""
+def experiment(name: str) -> tuple[WorldModel, SequenceDataModule]:
+    """Build model and data of a configuration of digit strokes."""
     allow_modules()
-    name = "rssm.yaml" if form == "gaussian" else "forbes.yaml"
     config = yaml.safe_load((ROOT / "configs" / "strokes" / name).read_text())
     parser = experiment_parser()
     built = parser.instantiate(parser.parse_object({name: config[name] for name in ("model", "data")}))
-    return built.model, built.data.sequences("train", built.data.train_index(0))
+    return built.model, built.data
+
+
+def strokes(form: str) -> tuple[WorldModel, SequenceBatch]:
+    """Build the default experiment on digit strokes and its first batch."""
+    world, data = experiment("rssm.yaml" if form == "gaussian" else "forbes.yaml")
+    return world, data.sequences("train", data.train_index(0))
 
 
 def dmc(form: str, batch: int) -> tuple[WorldModel, SequenceBatch]:

@@ -33,10 +33,11 @@ class Loop:
     def affine(self, weight: Tensor, bias: Tensor) -> Affine:
         """Bind W `(out, in)` and b, `(out,)` or one per step `(T, B, out)`, to a map that is called once a step."""
         shares = bias.expand(self.steps, self.batch, -1)  # (T, B, out)
-        if not torch.is_grad_enabled() or torch.compiler.is_compiling():
+        learns = torch.is_grad_enabled() and (weight.requires_grad or bias.requires_grad)
+        if not learns or torch.compiler.is_compiling():
             # Nothing to defer, or the compiler orders the products itself.
-            share = iter(shares.unbind(0))
-            return lambda x: torch.addmm(next(share), x, weight.T)
+            share, transposed = iter(shares.unbind(0)), weight.T  # (in, out)
+            return lambda x: torch.addmm(next(share), x, transposed)
         inputs: list[Tensor] = []
         share = iter(_Shares.apply(weight, shares, inputs).unbind(0))  # type: ignore[no-untyped-call]
         matrix = weight.detach().T  # (in, out)

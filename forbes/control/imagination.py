@@ -40,10 +40,8 @@ def frozen(*modules: nn.Module) -> Iterator[None]:
     """
     held = [(part, dict(part._parameters)) for module in modules for part in module.modules()]
     for part, parameters in held:
-        constants = {
-            name: parameter if parameter is None else parameter.detach() for name, parameter in parameters.items()
-        }
-        part._parameters.update(constants)  # type: ignore[arg-type]
+        stand_ins = {name: parameter.detach() for name, parameter in parameters.items() if parameter is not None}
+        part._parameters.update(stand_ins)  # type: ignore[arg-type]
     try:
         yield
     finally:
