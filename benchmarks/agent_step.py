@@ -88,6 +88,7 @@ SHAPES = {
         {**small(64), "likelihood": VectorNormal(), "state_dim": 4},
     ),
     "pixels": Shape(partial(Noise, 28), 16, 16, {}, {**small(96), "state_dim": 16, "horizon": 10}),
+    "dmc": Shape(partial(Noise, 64), 4, 25, {}, {}),  # the paper's networks, a twenty-fifth of its batch
     "gpu": Shape(partial(Noise, 64), 50, 50, {}, {}),
 }
 
@@ -188,7 +189,8 @@ def measure(name: str, device: torch.device, options: argparse.Namespace) -> lis
     shape = SHAPES[name]
     make = shape.environment
     if name != "hike":
-        make = find_environment(options.task, size=shape.environment().observation_shape[-1])
+        size = shape.environment().observation_shape[-1]
+        make = find_environment(options.task, size=size, fast=size < 64)
     with tempfile.TemporaryDirectory() as folder:
         data = stored(shape, folder)
         works = {form: Work(form, shape, data, device) for form in NAMES}
@@ -218,7 +220,7 @@ def row(name: str, form: str, times: dict[str, dict[str, list[float]]], operatio
 def main() -> None:
     """Measure, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=["hike", "pixels"])
+    parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=["hike", "pixels", "dmc"])
     parser.add_argument("--repeats", type=int, default=15, help="rounds")
     parser.add_argument("--threads", type=int, default=1, help="of torch")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
