@@ -10,20 +10,18 @@ parts, and clipping and Adam. Acting is one choice of the agent for one observat
 """
 
 import argparse
-import os
 import platform
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from train_step import Operations, ratio, say
+from train_step import Operations, common_options, conditions, publish, ratio, say
 
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.control.agent import Agent
@@ -219,20 +217,16 @@ def row(name: str, form: str, times: dict[str, dict[str, list[float]]], operatio
 
 def main() -> None:
     """Measure, print and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common_options(__doc__, 15, "rounds")
     parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=["hike", "pixels", "dmc"])
-    parser.add_argument("--repeats", type=int, default=15, help="rounds")
-    parser.add_argument("--threads", type=int, default=1, help="of torch")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--task", default="cartpole_swingup", help="of DeepMind Control, whose step is timed")
-    parser.add_argument("--output", type=Path, default=Path(__file__).with_suffix(".md"))
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     device = torch.device(options.device)
     machine = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.machine()
     table = [
-        f"torch {torch.__version__} on {machine}, {options.threads} thread(s), medians of {options.repeats} "
-        f"interleaved rounds, load average {os.getloadavg()[0]:.1f}. Milliseconds; loading also as a share.",
+        f"{conditions(options, machine)} Milliseconds; loading also as a share.",
         "",
         "| shape | form | world model | imagination | update | over Dreamer | over N = 1 "
         "| operations | loading | acting | environment |",
@@ -240,8 +234,7 @@ def main() -> None:
     ]
     for name in options.shapes:
         table += measure(name, device, options)
-    options.output.write_text("\n".join(table) + "\n")
-    print("\n".join(table))
+    publish(table, options)
 
 
 if __name__ == "__main__":

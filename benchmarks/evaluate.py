@@ -8,15 +8,12 @@ as in `train_step.py`. The cost of a digit and a particle is the slope of a line
 """
 
 import argparse
-import os
-import platform
 import statistics
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
-from train_step import experiment, say
+from train_step import common_options, conditions, experiment, publish, say
 
 from forbes.data import SequenceDataModule
 from forbes.evaluation.scoring import make_pass, score_split
@@ -71,24 +68,19 @@ def measure(options: argparse.Namespace) -> list[str]:
 
 def main() -> None:
     """Measure, print and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common_options(__doc__, 2, "rounds")
     parser.add_argument("--digits", type=int, nargs="+", default=[50, 100, 200, 400])
     parser.add_argument("--particles", type=int, nargs="+", default=[16, 32, 64, 128])
-    parser.add_argument("--repeats", type=int, default=2, help="rounds")
-    parser.add_argument("--threads", type=int, default=1, help="of torch")
-    parser.add_argument("--output", type=Path, default=Path(__file__).with_suffix(".md"))
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     table = [
-        f"torch {torch.__version__} on {platform.machine()}, {options.threads} thread(s), medians of {options.repeats} "
-        f"interleaved rounds, load average {os.getloadavg()[0]:.1f}.",
+        conditions(options),
         "",
         "| score | digits | K | seconds | ms per digit and particle |",
         "|---|---:|---:|---:|---:|",
         *measure(options),
     ]
-    options.output.write_text("\n".join(table) + "\n")
-    print("\n".join(table))
+    publish(table, options)
 
 
 if __name__ == "__main__":

@@ -150,6 +150,29 @@ def memory(shape: str, form: str, threads: int, dmc_batch: int) -> float:
     return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / unit
 
 
+def common_options(description: str | None, repeats: int, of_what: str) -> argparse.ArgumentParser:
+    """Give the parser of what every benchmark can be told; the table goes beside the file that is run."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    parser.add_argument("--repeats", type=int, default=repeats, help=of_what)
+    parser.add_argument("--output", type=Path, default=Path(sys.argv[0]).with_suffix(".md"))
+    return parser
+
+
+def conditions(options: argparse.Namespace, machine: str = platform.machine()) -> str:
+    """Say what a table was measured with."""
+    return (
+        f"torch {torch.__version__} on {machine}, {options.threads} thread(s), medians of {options.repeats} "
+        f"interleaved rounds, load average {os.getloadavg()[0]:.1f}."
+    )
+
+
+def publish(table: list[str], options: argparse.Namespace) -> None:
+    """Write the table, and print it."""
+    options.output.write_text("\n".join(table) + "\n")
+    print("\n".join(table))
+
+
 def say(line: str) -> None:
     """Report progress."""
     print(line, file=sys.stderr, flush=True)
@@ -189,21 +212,16 @@ def measure(shape: str, needed: dict[tuple[str, str], float], options: argparse.
 
 def main() -> None:
     """Measure, print and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--threads", type=int, default=1, help="of torch")
-    parser.add_argument("--repeats", type=int, default=20, help="updates of each form")
+    parser = common_options(__doc__, 20, "updates of each form")
     parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=SHAPES)
     parser.add_argument("--compile", nargs="*", choices=SHAPES, default=("strokes",), help="shapes to compile as well")
     parser.add_argument(
         "--dmc-batch", type=int, default=8, help="sequences of 50 steps at DMC's shape; the paper has 50"
     )
-    parser.add_argument("--output", type=Path, default=Path(__file__).with_suffix(".md"))
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     table = [
-        f"torch {torch.__version__} on {platform.machine()}, {options.threads} thread(s), "
-        f"median of {options.repeats} interleaved updates, DMC with {options.dmc_batch} sequences of 50 steps, "
-        f"load average {os.getloadavg()[0]:.1f}.",
+        f"{conditions(options)} DMC with {options.dmc_batch} sequences of 50 steps.",
         "",
         "| shape | form | ms per update | over gaussian | over flow | operations | MiB that updates need |",
         "|---|---|---:|---:|---:|---:|---:|",
@@ -211,8 +229,7 @@ def main() -> None:
     needed = memories(options)
     for shape in options.shapes:
         table += measure(shape, needed, options)
-    options.output.write_text("\n".join(table) + "\n")
-    print("\n".join(table))
+    publish(table, options)
 
 
 if __name__ == "__main__":

@@ -97,9 +97,9 @@ def collect_episodes(
         yield writer.append(episode, chance, policy, describe_environment(environment))
 
 
-def episode_seed(seed: int, number: int) -> int:
-    """Give the seed of an episode of a collection and of its policy."""
-    return derive_seed(seed, "episode", number) % 2**32  # what numpy's older generators take
+def episode_seed(seed: int, number: int, purpose: str = "episode") -> int:
+    """Give the seed of an episode and of its policy; `purpose` keeps those that measure apart from those collected."""
+    return derive_seed(seed, purpose, number) % 2**32  # what numpy's older generators take
 
 
 def play_whole(
@@ -115,8 +115,7 @@ def play_whole(
     except BrokenEnvironmentError as failure:
         if attempts == 1:
             raise ForbesError(
-                f"{failure}; so broke episode {number} {_ATTEMPTS} times, and those before it are stored. "
-                "Mend the environment"
+                f"{failure}; so broke episode {number} {_ATTEMPTS} times, nothing of it is stored. Mend the environment"
             ) from failure
         print(f"forbes: {failure}; episode {number} is dropped and played again", file=sys.stderr)
     return play_whole(environment, make_policy, seed, number, attempts - 1)

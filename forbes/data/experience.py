@@ -106,8 +106,8 @@ class Experience(SequenceSource):
 
     @property
     def newest(self) -> EpisodeRecord:
-        """The record of the latest episode."""
-        return self._open().records[self._open().watermark - 1]
+        """The record of the latest episode that is there."""
+        return list(self._open().records.values())[-1]
 
     @property
     def env_steps(self) -> int:

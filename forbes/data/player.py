@@ -3,6 +3,7 @@
 import multiprocessing
 import pickle
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 
 import torch
@@ -41,7 +42,8 @@ class Player:
             seed: of environment and policy.
         """
         message = pickle.dumps((make_policy, number, seed))  # a pipe's own way to send tensors shares their memory
-        self._connection.send_bytes(message)
+        with suppress(OSError):  # it has died since the last episode; `finish` says so
+            self._connection.send_bytes(message)
 
     def finish(self) -> Episode:
         """Wait for the episode.

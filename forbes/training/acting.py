@@ -11,13 +11,12 @@ from torch import Tensor
 from forbes.control.agent import Agent, Choice
 from forbes.control.policy import ScalarHead
 from forbes.data import SequenceBatch
-from forbes.data.collection import play
+from forbes.data.collection import episode_seed, play_whole
 from forbes.data.episodes import Episode
 from forbes.envs import Environment
 from forbes.errors import ForbesError
 from forbes.models import Filtered, StateSpaceModel
 from forbes.models.elbo import ElboTerms
-from forbes.seeding import derive_seed
 from forbes.training.world_model import WorldModel, require_at_least
 
 __all__ = ["Acting", "ActingModel", "play_measured"]
@@ -105,6 +104,8 @@ def play_measured(agent: ActingModel, environment: Environment, purpose: str, se
         purpose: keeps these episodes apart from all others of the same seed.
         seed: of the measurement.
         number: of the episode.
+
+    Raises:
+        ForbesError: where it breaks three times.
     """
-    chance = derive_seed(seed, purpose, number) % 2**32
-    return play(environment, Acting(agent, exploring=False)(environment, chance), chance)
+    return play_whole(environment, Acting(agent, exploring=False), episode_seed(seed, number, purpose), number)

@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import time
+from contextlib import closing
 from functools import partial
 
 import numpy as np
@@ -29,9 +30,8 @@ class Said:
 
 @pytest.fixture(scope="module")
 def player():
-    player = Player(partial(Parrot, steps=8))
-    yield player
-    player.close()
+    with closing(Player(partial(Parrot, steps=8))) as player:
+        yield player
 
 
 def test_the_episode_is_that_of_this_process(player):
@@ -57,18 +57,16 @@ def test_one_episode_after_another(player):
 
 
 def test_a_broken_episode_is_played_again(tmp_path):
-    player = Player(partial(Troubled, "raises", tmp_path / "ledger"))
-    player.begin(Said(0.5), number=0, seed=0)
-    assert len(player.finish().action) == 7
-    player.close()
+    with closing(Player(partial(Troubled, "raises", tmp_path / "ledger"))) as player:
+        player.begin(Said(0.5), number=0, seed=0)
+        assert len(player.finish().action) == 7
 
 
 def test_an_environment_that_breaks_each_time_is_named(tmp_path):
-    player = Player(partial(Troubled, "raises", tmp_path / "ledger", times=9))
-    player.begin(Said(0.5), number=4, seed=0)
-    with pytest.raises(ForbesError, match="so broke episode 4 3 times"):
-        player.finish()
-    player.close()
+    with closing(Player(partial(Troubled, "raises", tmp_path / "ledger", times=9))) as player:
+        player.begin(Said(0.5), number=4, seed=0)
+        with pytest.raises(ForbesError, match="so broke episode 4 3 times, nothing of it is stored"):
+            player.finish()
 
 
 class Kills(Said):
@@ -79,11 +77,15 @@ class Kills(Said):
 
 
 def test_a_player_that_dies_is_named():
-    player = Player(partial(Parrot, steps=8))
-    player.begin(Kills(0.5), number=0, seed=0)
-    with pytest.raises(ForbesError, match="the process that plays episodes has died, exit code -9"):
-        player.finish()
-    player.close()
+    """In an episode, or between two."""
+    died = "the process that plays episodes has died, exit code -9"
+    with closing(Player(partial(Parrot, steps=8))) as player:
+        player.begin(Kills(0.5), number=0, seed=0)
+        with pytest.raises(ForbesError, match=died):
+            player.finish()
+        player.begin(Said(0.5), number=1, seed=1)
+        with pytest.raises(ForbesError, match=died):
+            player.finish()
 
 
 class Told(Said):

@@ -13,7 +13,7 @@ from forbes.data.episodes import Episode
 from forbes.errors import ForbesError
 from forbes.training.acting import Acting, ActingModel, play_measured
 
-__all__ = ["Collect", "evaluation_episode", "require_agent"]
+__all__ = ["Collect", "require_agent"]
 
 
 class Collect(Callback):
@@ -94,13 +94,12 @@ class Collect(Callback):
         if number % self.evaluate_every and number != trainer.max_epochs:
             return
         with _eval_mode(agent):
-            played = [evaluation_episode(trainer, agent, self.seed, k) for k in range(self.evaluation_episodes)]
+            played = [self.evaluation_episode(trainer, agent, k) for k in range(self.evaluation_episodes)]
         agent.log("return/acting", sum(episode.total_reward for episode in played) / len(played), batch_size=1)
 
-
-def evaluation_episode(trainer: Trainer, agent: ActingModel, seed: int, number: int) -> Episode:
-    """Play one of the episodes that measure an agent, in eval mode, while it learns: they are the same each time."""
-    return play_measured(agent, _experience(trainer).environment, "evaluation", seed, number)
+    def evaluation_episode(self, trainer: Trainer, agent: ActingModel, number: int) -> Episode:
+        """Play one of the episodes that measure an agent, in eval mode, while it learns: the same each time."""
+        return play_measured(agent, _experience(trainer).environment, "evaluation", self.seed, number)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from forbes.data import SequenceDataModule
 from forbes.figures.video import gif
 from forbes.files import replace_file
 from forbes.training.acting import ActingModel
-from forbes.training.callbacks.collect import evaluation_episode, require_agent
+from forbes.training.callbacks.collect import Collect, require_agent
 from forbes.training.callbacks.picture import FileCallback, require_frames
 from forbes.training.world_model import WorldModel
 
@@ -20,7 +20,6 @@ class EpisodeVideo(FileCallback):
     """Writes `figures/episode.gif`: an episode without exploration, the first of those that `Collect` measures by.
 
     Args:
-        seed: that of `Collect`.
         every: play after every k-th epoch.
 
     Raises:
@@ -29,9 +28,8 @@ class EpisodeVideo(FileCallback):
 
     filename = "episode.gif"
 
-    def __init__(self, seed: int = 0, every: int = 10) -> None:
+    def __init__(self, every: int = 10) -> None:
         super().__init__(every)
-        self.seed = seed
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Refuse what cannot be filmed, before hours are spent."""
@@ -40,5 +38,7 @@ class EpisodeVideo(FileCallback):
 
     def write(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule, path: Path) -> None:
         """See `FileCallback`."""
-        episode = evaluation_episode(trainer, cast(ActingModel, module), self.seed, 0)
+        callbacks = trainer.callbacks  # type: ignore[attr-defined]  # Lightning gives it no type
+        collect = next(callback for callback in callbacks if isinstance(callback, Collect))
+        episode = collect.evaluation_episode(trainer, cast(ActingModel, module), 0)
         replace_file(path, gif([episode.observation]))
