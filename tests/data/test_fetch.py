@@ -280,7 +280,7 @@ def test_a_truncated_archive_is_refused(tarball, share):
         convert(read_archive(tarball, wanted_files(DIGITS)), DIGITS, tarball)
 
 
-@pytest.mark.parametrize("content", [b"no archive", gzip.compress(b"no tar archive" * 100)])
+@pytest.mark.parametrize("content", [b"no archive", gzip.compress(b"no tar archive" * 100)], ids=["text", "gzip"])
 def test_what_is_no_archive_is_refused(tmp_path, content):
     (tmp_path / "file").write_bytes(content)
 
