@@ -88,8 +88,8 @@ class MLPDecoder(Decoder):
         observation_shape: (C, H, W), or (O,).
         width: width of each hidden layer.
         layers: how many hidden layers.
-        output_bias: the output it starts from; the logit of the mean pixel, -4 for strokes, saves the first thousand
-            updates of learning that most pixels are off.
+        output_bias: the output it starts from. The mean pixel, for strokes a logit of -4 or a value of -0.48, saves
+            the first thousand updates of learning that most pixels are off, in which a posterior can collapse.
     """
 
     def __init__(
@@ -148,6 +148,7 @@ class ConvDecoder(Decoder):
         feature_dim: F.
         observation_shape: (C, H, W), H = W = 64 or 28.
         channels: of the last hidden layer; each layer before has twice as many.
+        output_bias: the output it starts from, see `MLPDecoder`.
 
     Raises:
         ForbesError: for another size.
@@ -155,7 +156,9 @@ class ConvDecoder(Decoder):
 
     kernels: ClassVar = {64: (5, 5, 6, 6), 28: (5, 5, 4)}
 
-    def __init__(self, feature_dim: int, observation_shape: tuple[int, ...], channels: int = 32) -> None:
+    def __init__(
+        self, feature_dim: int, observation_shape: tuple[int, ...], channels: int = 32, output_bias: float = 0.0
+    ) -> None:
         super().__init__()
         depth, size, _ = observation_shape
         if size not in self.kernels:
@@ -164,9 +167,13 @@ class ConvDecoder(Decoder):
         widths = [channels * 2 ** (len(kernels) - k - 1) for k in range(1, len(kernels))] + [depth]
         self.start_dim = channels * 2 ** len(kernels)
         self.start = nn.Linear(feature_dim, self.start_dim)
-        blocks: list[nn.Module] = []
-        for before, after, kernel in zip([self.start_dim, *widths[:-1]], widths, kernels, strict=True):
-            blocks += [nn.ConvTranspose2d(before, after, kernel, stride=2), nn.ReLU()]
+        layers = [
+            nn.ConvTranspose2d(before, after, kernel, stride=2)
+            for (before, after), kernel in zip(pairwise([self.start_dim, *widths]), kernels, strict=True)
+        ]
+        if output_bias:
+            nn.init.constant_(layers[-1].get_parameter("bias"), output_bias)
+        blocks = [block for layer in layers for block in (layer, nn.ReLU())]
         self.net = nn.Sequential(*blocks[:-1])
 
     def forward(self, features: Tensor) -> Tensor:

@@ -30,12 +30,13 @@ def test_decoders_give_images(family, shape):
     assert family(17, shape)(torch.zeros(2, 17)).shape == (2, *shape)
 
 
-def test_mlp_decoder_starts_from_the_output_it_is_told():
+@pytest.mark.parametrize("family", [ConvDecoder, MLPDecoder])
+def test_decoders_start_from_the_output_they_are_told(family):
     torch.manual_seed(0)
     features = torch.zeros(1, 17)
 
     for bias in (0.0, -4.0):
-        output = MLPDecoder(17, (1, 28, 28), output_bias=bias)(features)
+        output = family(17, (1, 28, 28), output_bias=bias)(features)
         assert output.mean().item() == pytest.approx(bias, abs=0.5)
 
 
