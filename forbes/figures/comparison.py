@@ -39,6 +39,7 @@ def scores(comparison: Comparison) -> Figure:
                 axes.plot([own["mean"].mean()] * 2, [place - 0.35, place + 0.35], color=colour)
             axes.set_title(_in_lines(metric))
             axes.margins(x=0.15)
+            axes.locator_params(axis="x", nbins=4)  # more labels than that touch
         for axes in panels[len(metrics) :]:
             axes.remove()
         panels[0].set_yticks(range(len(families)), families)
