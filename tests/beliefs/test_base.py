@@ -28,6 +28,7 @@ CONTINUOUS = {
     "spline": partial(FlowBelief, layers=2, width=8, coupling="spline", bins=5),
     "mixture": partial(MixtureBelief, components=3),
 }
+SMOOTH = [name for name in CONTINUOUS if name != "mixture"]  # for the same noise, a draw is a smooth map of its context
 DISCRETE = {"categorical": one_hots}
 FAMILIES = CONTINUOUS | DISCRETE
 
@@ -138,8 +139,20 @@ def test_log_prob_of_a_sample_is_what_rsample_gave(family):
     torch.testing.assert_close(head.log_prob(state, context), log_prob)
 
 
-def test_samples_are_reparameterised(continuous):
-    """The gradient of samples is that of E[exp(-|s|² / 8)], by the midpoint rule on the grid."""
+@pytest.mark.parametrize("name", SMOOTH)
+def test_samples_are_reparameterised(name):
+    """d/dc E[s] by the gradient of samples equals the difference of means with common noise."""
+    head, context = random_head(CONTINUOUS[name]), contexts(1)[0].requires_grad_()
+
+    def mean(at):
+        torch.manual_seed(0)
+        return head.rsample(at, (100,))[0].sum(-1).mean()
+
+    assert torch.autograd.gradcheck(mean, context)
+
+
+def test_gradients_of_samples_are_unbiased(continuous):
+    """Their mean is d/dc E[exp(-|s|² / 8)], by the midpoint rule on a grid."""
     head, number = random_head(continuous), 20_000
     context = contexts(1)[0].requires_grad_()
     repeated = context.detach().expand(number, -1).clone().requires_grad_()  # (number, C)
