@@ -84,6 +84,8 @@ class BeliefModel(nn.Module, ABC):
     """What training logs beside the bound: parts of it, or names of `ElboTerms.auxiliary`."""
     particles: int = 1
     """How many of them one draw of the belief has."""
+    center: Tensor | None
+    """The mean target, `(*O)`: encoder and decoder see what differs from it; None leaves both as they are."""
 
     def __init__(
         self,
@@ -100,6 +102,7 @@ class BeliefModel(nn.Module, ABC):
         self.encoder, self.decoder, self.likelihood = encoder, decoder, likelihood
         self.transition = perceptron(input_dim, mlp_dim, mlp_layers)
         self.gru = nn.GRUCell(mlp_dim, hidden_dim)
+        self.register_buffer("center", None)
 
     @property
     @abstractmethod
@@ -149,12 +152,15 @@ class BeliefModel(nn.Module, ABC):
 
     def encode(self, target: Tensor) -> Tensor:
         """Encode every frame as `Likelihood.target` or `Likelihood.sample` gives it: `(B, T, *O)` to e `(B, T, E)`."""
-        embedding: Tensor = self.encoder(target.flatten(0, 1)).to(target.dtype)  # (B T, E)
+        shown = target if self.center is None else target - self.center
+        embedding: Tensor = self.encoder(shown.flatten(0, 1)).to(target.dtype)  # (B T, E)
         return embedding.view(*target.shape[:2], -1)  # (B, T, E)
 
     def decode(self, features: Tensor) -> Tensor:
         """Give the likelihood's parameters: features `(*, F)` to `(*, *O)`."""
         output: Tensor = self.decoder(features.flatten(0, -2))  # (N, *O)
+        if self.center is not None:
+            output = output + self.center
         return output.view(*features.shape[:-1], *output.shape[1:])  # (*, *O)
 
     def log_likelihood(self, features: Tensor, target: Tensor) -> Tensor:

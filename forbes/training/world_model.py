@@ -14,7 +14,7 @@ from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.models.base import ModelFamily
 from forbes.models.elbo import ElboTerms, FreeNats, elbo_loss
-from forbes.models.likelihoods import Likelihood, Normal
+from forbes.models.likelihoods import Likelihood, Normal, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
@@ -55,10 +55,12 @@ class WorldModel(LightningModule):
         schedule: "constant", or "cosine" to 0 at the end of the training.
         warmup: updates over which the learning rate rises from 0; a high rate needs it.
         clip_norm: gradients are scaled down to this norm.
+        center: measure the mean observation on the first batch; encoder and decoder then see what differs from it. The
+            same models, found several times faster where most of a frame never changes; for Gaussian likelihoods.
         seed: of the noise of training and validation.
 
     Raises:
-        ForbesError: when a size is below 1, or the learning rate or `clip_norm` below 0.
+        ForbesError: when a size is below 1, the learning rate or `clip_norm` below 0, or `center` does not fit.
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class WorldModel(LightningModule):
         schedule: Literal["constant", "cosine"] = "constant",
         warmup: int = 0,
         clip_norm: float = 100.0,
+        center: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -100,6 +103,9 @@ class WorldModel(LightningModule):
             mlp_layers,
             prior,
         )
+        if center:
+            _require_mean(self.model.likelihood)
+            self.model.center = torch.zeros(observation_shape)
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.learning_rate, self.schedule, self.warmup = learning_rate, schedule, warmup
         self.clip_norm, self.seed = clip_norm, seed
@@ -116,6 +122,8 @@ class WorldModel(LightningModule):
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
         """Seed the noise of this update, so that a resumed run draws the same."""
         torch.manual_seed(derive_seed(self.seed, "update", self.global_step))
+        if self.model.center is not None and self.global_step == 0:
+            self.model.center.copy_(self.model.likelihood.target(batch.observation)[batch.mask].mean(0))  # (*O)
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Give the loss of one update; logs the bound without free nats and its parts, per sequence."""
@@ -182,6 +190,15 @@ class WorldModel(LightningModule):
         }
         values = {self.objective_name: terms.elbo.mean()} | {name: parts[name] for name in self.model.parts}
         self.log_dict({f"{split}/{name}": value.detach() for name, value in values.items()}, batch_size=len(terms.mask))
+
+
+def _require_mean(likelihood: Likelihood) -> None:
+    """Raise a ForbesError where a decoder's output is not the mean of the target, so cannot be one off a center."""
+    if not isinstance(likelihood, Normal | VectorNormal):
+        raise ForbesError(
+            f"WorldModel: center with the likelihood {type(likelihood).__name__}, expected Normal or VectorNormal. "
+            "Leave center out"
+        )
 
 
 def require_at_least(least: float, where: str, **numbers: Any) -> None:
