@@ -22,6 +22,7 @@ from forbes.errors import ForbesError
 __all__ = ["BrokenEnvironmentError", "EnvironmentProcess", "belong_to_parent"]
 
 START_LIMIT = 180.0
+_UNGUARDED = '. It reads the script that started it anew: keep its commands under `if __name__ == "__main__":`'
 """Seconds to import and build an environment; two tries of a renderer, of 60 each, among them."""
 
 
@@ -137,6 +138,7 @@ class EnvironmentProcess(Environment):
             status = self._process.exitcode
             raise BrokenEnvironmentError(
                 f"{self._name}: its process has died in {method}, exit code {status}"
+                + (_UNGUARDED if method == "start" else "")
             ) from error
         if isinstance(answer, _Report):
             kind = ForbesError if answer.refused else BrokenEnvironmentError

@@ -122,3 +122,16 @@ if __name__ == "__main__":
     if not (ended := ends(child)):
         os.kill(child, signal.SIGKILL)
     assert ended
+
+
+def test_a_script_without_a_guard_is_told_what_it_lacks(tmp_path):
+    """A spawned process imports the script that started it, which would start another one, and so on."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from forbes.envs import EnvironmentProcess, find_environment\nEnvironmentProcess(find_environment('tiger'))\n"
+    )
+
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=120)
+
+    assert done.returncode != 0
+    assert 'keep its commands under `if __name__ == "__main__":`' in done.stderr.splitlines()[-1]

@@ -11,7 +11,8 @@ from torch.utils.data import DataLoader
 
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ParticleModel, VectorModel, elbo_loss
+from forbes.errors import ForbesError
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, Normal, ParticleModel, VectorModel, elbo_loss
 from forbes.training import WorldModel
 
 # Lightning 2.6 uses what torch 2.13 deprecates, and has its opinion on loaders without workers.
@@ -165,6 +166,45 @@ def test_a_model_with_another_filter_is_trained_by_its_own_bound(options, bound,
         assert logged["loss"] == pytest.approx(
             -terms.elbo.sum().item() / terms.mask.sum().item() + logged["train/overshoot"]
         )
+
+
+def mean_frame(batch):
+    return batch.observation[batch.mask].double().mean(0).float() - 0.5  # (*O)
+
+
+def test_a_centered_model_is_the_plain_model_of_what_differs_from_the_mean_frame():
+    """The density of a Gaussian moves with its mean; the first layer's bias takes up what the encoder is not shown."""
+    options, batch = {"likelihood": Normal(scale=1)}, make_batch()
+    centered, plain = make_world_model(**options, center=True), make_world_model(**options)
+    centered.model.center.copy_(mean_frame(batch))
+    with torch.no_grad():
+        first, last = plain.model.encoder.net[0][0], plain.model.decoder.net[-1]
+        first.bias -= first.weight @ mean_frame(batch).flatten()
+        last.bias += mean_frame(batch).flatten()
+
+    ours, theirs = (make_elbo(module, batch) for module in (centered, plain))
+
+    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5)  # float32 over 80 pixels
+
+
+def make_elbo(module, batch):
+    torch.manual_seed(0)
+    return module.terms(batch).elbo
+
+
+def test_the_mean_frame_is_that_of_the_first_batch_and_stays():
+    module = make_world_model(likelihood=Normal(scale=1), center=True)
+
+    fit(module, updates=3)
+
+    torch.testing.assert_close(module.model.center, mean_frame(make_batch()))
+    assert "model.center" in module.state_dict()
+    assert "model.center" not in make_world_model().state_dict()
+
+
+def test_logits_have_no_mean_frame():
+    with pytest.raises(ForbesError, match="center with the likelihood Bernoulli, expected Normal or VectorNormal"):
+        make_world_model(center=True)
 
 
 def test_the_weight_of_the_divergence_rises_to_one():
