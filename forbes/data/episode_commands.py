@@ -142,7 +142,7 @@ def add_episode_commands(add: Callable[[str, Callable[..., Any], str], argparse.
     play.add_argument("--pixels", action=argparse.BooleanOptionalAction, help="observe images, or what is measured")
     play.add_argument("--size", type=positive, help="pixels a side (64)")
     play.add_argument("--camera", type=int, help="number of the camera")
-    play.add_argument("--fast", action="store_const", const=True, help="no shadows, no multisampling: other pixels")
+    play.add_argument("--fast", action="store_const", const=True, help="no shadows: other pixels")
     play.add_argument("--timeout", type=float, default=60.0, help="seconds for an answer of the environment (60)")
 
     look = add("info", info, "info episodes/cartpole")
