@@ -101,6 +101,15 @@ def test_fast_pixels_are_other_pixels_and_say_so(backend):
     assert frames[0].shape == (3, 32, 32)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_pole_thinner_than_a_pixel_is_in_a_fast_frame(backend, seed):
+    """One sample a pixel misses it: these rows are then all sky, whose red differs by 4."""
+    with EnvironmentProcess(find_environment("cartpole_balance", backend=backend, fast=True, size=28)) as environment:
+        red = environment.reset(seed).observation[0, 6:12].astype(int)  # the rows of an upright pole
+
+    assert (np.ptp(red, axis=1) > 15).all()
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
