@@ -23,25 +23,35 @@ __all__ = ["Acting", "ActingModel", "play_measured"]
 
 
 class ActingModel(WorldModel, ABC):
-    r"""A world model with rewards: :math:`p(r_t \mid f_t) = N(\hat r(f_t), 1)` with the features :math:`f = [h, s]`.
+    r"""A world model with rewards: :math:`p(r_t \mid f_t) = N(\hat r(f_t), \sigma_r^2)` with the features `f = [h, s]`.
 
     .. math:: L_{model} = -J_{Model} - \overline{\log p(r_t \mid f_t)}
 
     Args:
         control_dim: width of the reward's perceptron, and of what else acts.
         reward_layers: hidden layers of the reward's.
+        reward_std: :math:`\sigma_r`; below 1, the belief is to know the reward better. PlaNet's scale of 10 is 0.32.
         exploration: standard deviation of the noise on the actions of collected episodes.
         **world: arguments of `WorldModel`.
 
     Raises:
-        ForbesError: when a size is below 1, the noise below 0, or the data have no actions.
+        ForbesError: when a size is below 1, the noise below 0, `reward_std` not above it, or the data have no actions.
     """
 
-    def __init__(self, control_dim: int = 200, reward_layers: int = 2, exploration: float = 0.3, **world: Any) -> None:
+    def __init__(
+        self,
+        control_dim: int = 200,
+        reward_layers: int = 2,
+        reward_std: float = 1.0,
+        exploration: float = 0.3,
+        **world: Any,
+    ) -> None:
         super().__init__(**world)
         name = type(self).__name__
         require_at_least(1, name, control_dim=control_dim, reward_layers=reward_layers)
         require_at_least(0, name, exploration=exploration)
+        if not reward_std > 0:
+            raise ForbesError(f"{name}: reward_std is {reward_std}, expected a number above 0. 1 is Dreamer's")
         if type(self.model) is not StateSpaceModel:
             raise ForbesError(
                 f"{name}: its model is a {type(self.model).__name__}, expected a StateSpaceModel. Name none"
@@ -51,7 +61,7 @@ class ActingModel(WorldModel, ABC):
             raise ForbesError(
                 f"{name}: the data have no actions, expected some. Choose another source, or a WorldModel"
             )
-        self.exploration = exploration
+        self.exploration, self.reward_std = exploration, reward_std
         self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, reward_layers)
 
     @abstractmethod
@@ -62,9 +72,9 @@ class ActingModel(WorldModel, ABC):
         """Filter a batch; give the trajectory, the parts of the bound, and log p(r_t | f_t) in nats, `(B, T)`."""
         seen = self.model.see(batch.observation, batch.action)
         filtered = self.model.filter(seen.embedding, seen.action)
-        error = self.reward(filtered.features) - batch.reward  # (B, T)
+        error = (self.reward(filtered.features) - batch.reward) / self.reward_std  # (B, T)
         terms = self.model.bound(filtered, seen, batch.mask)
-        return filtered, terms, -0.5 * (error.square() + math.log(2 * math.pi))
+        return filtered, terms, -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Give the loss of one update of the world model; logs its parts."""
