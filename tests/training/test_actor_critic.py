@@ -61,14 +61,17 @@ def gradients(loss, modules):
     return torch.autograd.grad(loss, parameters, allow_unused=True, retain_graph=True)
 
 
-def test_the_world_model_learns_from_its_own_loss_only():
-    ours, batch = agent(), make_batch()
+@pytest.mark.parametrize("reward_std", [1.0, 0.1])
+def test_the_world_model_learns_from_its_own_loss_only(reward_std):
+    ours, batch = agent(reward_std=reward_std), make_batch()
     torch.manual_seed(1)
     seen = ours.model.see(batch.observation, batch.action)
     filtered = ours.model.filter(seen.embedding, seen.action)
     terms = ours.model.bound(filtered, seen, batch.mask)
-    reward = torch.distributions.Normal(ours.reward(filtered.features), 1.0).log_prob(batch.reward)
+    reward = torch.distributions.Normal(ours.reward(filtered.features), reward_std).log_prob(batch.reward)
 
+    torch.manual_seed(1)
+    torch.testing.assert_close(ours.explain(batch)[2], reward)
     own = gradients(ours.loss(terms) - reward.mean(), [ours.model, ours.reward])
     together = gradients(loss_of(ours, batch), [ours.model, ours.reward])
 
@@ -193,6 +196,7 @@ def test_learns_the_action_that_pays(belief, trajectories):
         ({"trajectories": 0}, "trajectories is 0, expected at least 1"),
         ({"horizon": 1}, "horizon is 1, expected at least 2"),
         ({"actor_rate": float("nan")}, "actor_rate is nan, expected at least 0"),
+        ({"reward_std": 0.0}, "reward_std is 0.0, expected a number above 0"),
         ({"action_dim": 0}, "the data have no actions"),
     ],
 )
