@@ -1,6 +1,6 @@
 """A process whose belief is known exactly, as an environment: a learned agent can be held against the exact belief."""
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -13,7 +13,9 @@ from forbes.pomdps import CategoricalBelief, ExactBelief, GaussianMixtureBelief,
 from forbes.pomdps.base import require_positive
 from forbes.pomdps.hmm import FiniteProcess
 
-__all__ = ["KnownProcess"]
+__all__ = ["KnownProcess", "Shown"]
+
+Shown = Literal["observation", "exact_belief", "nothing"]
 
 
 class KnownProcess(Environment):
@@ -25,25 +27,29 @@ class KnownProcess(Environment):
     c is `Process.action_scale`, so that an agent's actions fill [-1, 1]; those of finite processes are one-hot.
     `Process.exact_filter` of an episode takes its observations and c times its actions.
 
-    With `exact_belief` the agent is shown, in place of o_t, what determines the exact belief p(s_t | o_1:t, a_1:t-1):
-    probabilities of finite states, or weights, means and standard deviations of a Gaussian mixture. What it earns then
-    is what perfect filtering is worth to the same agent.
+    Two references for an agent that filters. `shows="exact_belief"` shows, in place of o_t, what determines
+    p(s_t | o_1:t, a_1:t-1): probabilities of finite states, or weights, means and standard deviations of a Gaussian
+    mixture; what the agent earns then is what perfect filtering is worth to it. `shows="nothing"` shows zeros; what it
+    earns then needs no observation at all.
 
     Args:
         process: one that has rewards, e.g. `MountainHike`.
         time_limit: steps after which an episode is truncated.
-        exact_belief: show the exact belief.
+        shows: "observation", "exact_belief" or "nothing".
 
     Raises:
-        ForbesError: where the exact belief has no such numbers.
+        ForbesError: where `shows` is none of these, or the exact belief has no such numbers.
     """
 
-    def __init__(self, process: Process, time_limit: int = 75, exact_belief: bool = False) -> None:
+    def __init__(self, process: Process, time_limit: int = 75, shows: Shown = "observation") -> None:
         require_positive("KnownProcess", time_limit=time_limit)
-        self.process, self.time_limit, self.exact_belief = process, time_limit, exact_belief
+        if shows not in get_args(Shown):
+            raise ForbesError(f"shows is {shows!r}, expected {' or '.join(get_args(Shown))}. Choose one of them")
+        self.process, self.time_limit = process, time_limit
+        self.shows: Shown = shows
         self.observation_shape, self.action_dim = (process.observation_dim,), process.action_dim
         self.discrete = isinstance(process, FiniteProcess)
-        if exact_belief:
+        if shows == "exact_belief":
             self.observation_shape = self.reset(0).observation.shape
 
     def reset(self, seed: int) -> Step:
@@ -69,7 +75,9 @@ class KnownProcess(Environment):
 
     def _observe(self) -> NDArray[np.float32]:
         seen = self.process.emission(self._state).sample(1, self._generator)  # (1, 1, O)
-        if not self.exact_belief:
+        if self.shows == "nothing":
+            seen = torch.zeros_like(seen)
+        if self.shows != "exact_belief":
             return seen.flatten().float().numpy()  # (O,)
         self._seen.append(seen.squeeze(0))
         history = (torch.stack(values, 1) for values in (self._seen, self._taken))  # (1, t, O), (1, t, A)
@@ -79,7 +87,7 @@ class KnownProcess(Environment):
         """See `Environment.describe`: the process's numbers are those of its attributes."""
         plain = {name: value for name, value in vars(self.process).items() if isinstance(value, int | float | str)}
         made_by = {"torch": torch.__version__}
-        known = {"time_limit": self.time_limit, "exact_belief": self.exact_belief}
+        known = {"time_limit": self.time_limit, "shows": self.shows}
         return {"task": type(self.process).__name__, **known, **plain, "made_by": made_by}
 
 
@@ -89,8 +97,8 @@ def _numbers(belief: ExactBelief) -> Tensor:
         return belief.mean[0, -1]  # (S,)
     if not isinstance(belief, GaussianMixtureBelief):
         raise ForbesError(
-            f"exact_belief: a {type(belief).__name__} has too many numbers, expected finite states or Gaussians. "
-            "Leave it out"
+            f"shows: the exact belief is a {type(belief).__name__} of too many numbers, expected finite states or "
+            "Gaussians. Choose observation"
         )
     std = belief.covariance[-1].diagonal().sqrt()  # (D,)
     return torch.cat((belief.log_weight[0, -1].exp(), belief.component_mean[0, -1].flatten(), std))  # (K + K D + D,)

@@ -4,12 +4,15 @@ import difflib
 import inspect
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from forbes.envs.base import Environment
 from forbes.envs.control import DeepMindControl
 from forbes.envs.gymnasium import Gymnasium
 from forbes.errors import ForbesError
+
+if TYPE_CHECKING:
+    from forbes.envs.known_process import Shown
 
 __all__ = ["TASKS", "find_environment"]
 
@@ -52,7 +55,7 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
     return partial(make, **options)
 
 
-def _open_process(task: str, exact_belief: bool = False) -> Environment:
+def _open_process(task: str, shows: "Shown" = "observation") -> Environment:
     """Build a known process where it is used: tensors do not travel, and only here is torch imported."""
     from forbes import pomdps
     from forbes.envs.known_process import KnownProcess
@@ -63,7 +66,7 @@ def _open_process(task: str, exact_belief: bool = False) -> Environment:
         "t_maze": pomdps.TMaze,
         "tiger": pomdps.Tiger,
     }
-    return KnownProcess(processes[task](), _HORIZONS[task], exact_belief)
+    return KnownProcess(processes[task](), _HORIZONS[task], shows)
 
 
 def _descendants(kind: type) -> Iterator[type]:

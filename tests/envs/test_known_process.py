@@ -132,7 +132,7 @@ def test_names_that_are_nearly_right_are_suggested():
 @pytest.mark.parametrize("task", ["mountain_hike", "multi_start_hike", "t_maze", "tiger"])
 def test_with_the_exact_belief_an_episode_is_the_same_and_its_belief_is_shown(task):
     """Beside the ordinary episode of the same seed and actions, whose observations are filtered at the end."""
-    plain, shown = find_environment(task)(), find_environment(task, exact_belief=True)()
+    plain, shown = find_environment(task)(), find_environment(task, shows="exact_belief")()
     process = plain.process
 
     ordinary, believed = (play(environment, random_policy(environment, 3), 3) for environment in (plain, shown))
@@ -151,5 +151,22 @@ def test_with_the_exact_belief_an_episode_is_the_same_and_its_belief_is_shown(ta
 
 
 def test_refuses_to_show_a_belief_of_too_many_numbers():
-    with pytest.raises(ForbesError, match="exact_belief: a GridBelief has too many numbers"):
-        KnownProcess(MirrorSensor(), exact_belief=True)
+    with pytest.raises(ForbesError, match="shows: the exact belief is a GridBelief of too many numbers"):
+        KnownProcess(MirrorSensor(), shows="exact_belief")
+
+
+@pytest.mark.parametrize("task", ["mountain_hike", "tiger"])
+def test_who_is_shown_nothing_walks_the_same_way(task):
+    plain, blind = find_environment(task)(), find_environment(task, shows="nothing")()
+
+    seen, unseen = (play(environment, random_policy(environment, 3), 3) for environment in (plain, blind))
+
+    for name in ("action", "reward"):
+        np.testing.assert_array_equal(getattr(seen, name), getattr(unseen, name))
+    assert unseen.observation.shape == seen.observation.shape
+    assert not unseen.observation.any()
+
+
+def test_says_what_can_be_shown():
+    with pytest.raises(ForbesError, match="shows is 'all', expected observation or exact_belief or nothing"):
+        KnownProcess(MountainHike(), shows="all")
