@@ -2,11 +2,12 @@
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from forbes.control.agent import Choice, explore, take_mode
 from forbes.control.imagination import belief_samples, frozen
-from forbes.control.policy import Actor, ScalarHead
+from forbes.control.policy import Actor, ScalarHead, TanhNormal
 from forbes.control.returns import actor_loss, critic_loss, lambda_returns
 from forbes.data import SequenceBatch
 from forbes.models import Filtered, State
@@ -24,7 +25,7 @@ class ImaginationActorCritic(ActingModel):
     .. math::
 
         L_{model} = -J_{Model} - \overline{\log p(r_t \mid f_t)}, \qquad
-        L_{actor} = -\overline{\gamma^{\tau-1} V_\tau}, \qquad
+        L_{actor} = -\overline{\gamma^{\tau-1} (V_\tau - \eta \log \pi(a_{\tau-1}))}, \qquad
         L_{critic} = \overline{\gamma^{\tau-1} \tfrac12 (v(f_\tau) - \mathrm{sg}(V_\tau))^2}
 
     with the features :math:`f = [h, s]`, and λ-returns V along H imagined steps from N samples of the belief at every
@@ -36,6 +37,8 @@ class ImaginationActorCritic(ActingModel):
         discount: :math:`\gamma`.
         lambda_: :math:`\lambda` of the returns.
         control_dim: width of actor, critic and reward.
+        actor_entropy: :math:`\eta`, the reward of a nat (DreamerV2, arXiv 2010.02193), 0 in paper and Dreamer. With
+            it, an actor that a model still wrong has driven to the border of the actions can come back.
         actor_layers: hidden layers of the actor.
         critic_layers: hidden layers of the critic.
         actor_rate: learning rate of the actor.
@@ -53,6 +56,7 @@ class ImaginationActorCritic(ActingModel):
         discount: float = 0.99,
         lambda_: float = 0.95,
         control_dim: int = 200,
+        actor_entropy: float = 0.0,
         actor_layers: int = 2,
         critic_layers: int = 2,
         actor_rate: float = 8e-5,
@@ -63,12 +67,12 @@ class ImaginationActorCritic(ActingModel):
         name = type(self).__name__
         require_at_least(1, name, trajectories=trajectories, actor_layers=actor_layers, critic_layers=critic_layers)
         require_at_least(2, name, horizon=horizon)
-        require_at_least(0, name, actor_rate=actor_rate, critic_rate=critic_rate)
+        require_at_least(0, name, actor_rate=actor_rate, critic_rate=critic_rate, actor_entropy=actor_entropy)
         features = self.model.hidden_dim + self.model.state_dim
         self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers)
         self.critic = ScalarHead(features, control_dim, critic_layers)
         self.trajectories, self.horizon, self.discount, self.lambda_ = trajectories, horizon, discount, lambda_
-        self.actor_rate, self.critic_rate = actor_rate, critic_rate
+        self.actor_rate, self.critic_rate, self.actor_entropy = actor_rate, critic_rate, actor_entropy
 
     def choose(self, exploring: bool) -> Choice:
         """See `ActingModel.choose`: a draw with noise, or the mode."""
@@ -86,16 +90,21 @@ class ImaginationActorCritic(ActingModel):
         samples = belief_samples(self.model, filtered, self.trajectories)
         start = State(*(values.flatten(0, 2) for values in samples))  # (N B T, …)
         valid = mask.expand(self.trajectories, -1, -1).flatten()  # (N B T,)
+        surprises: list[Tensor] = []
 
-        def policy(features: Tensor) -> Tensor:
-            action: Tensor = self.actor(features.detach()).rsample()[0]
+        def act(features: Tensor) -> Tensor:
+            policy: TanhNormal = self.actor(features.detach())
+            action, log_prob = policy.rsample()
+            surprises.append(-log_prob)
             return action
 
         with frozen(self.model, self.reward, self.critic):
-            features = self.model.roll(start, policy, self.horizon).features  # (N B T, H, F)
+            features = self.model.roll(start, act, self.horizon).features  # (N B T, H, F)
             returns = lambda_returns(self.reward(features), self.critic(features), self.discount, self.lambda_)
         value = self.critic(features[:, :-1].detach())  # (N B T, H - 1)
-        return actor_loss(returns, self.discount, valid), critic_loss(value, returns, self.discount, valid)
+        entropy = torch.stack(surprises[:-1], -1)  # (N B T, H - 1), of the action that led to each of these states
+        actor = actor_loss(returns + self.actor_entropy * entropy, self.discount, valid)
+        return actor, critic_loss(value, returns, self.discount, valid)
 
     def groups(self) -> list[Group]:
         """See `WorldModel.groups`: three, so that no gradient is scaled down for another's sake."""

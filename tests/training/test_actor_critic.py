@@ -127,9 +127,10 @@ def test_the_first_sample_is_the_path_the_filter_took_and_the_others_differ():
     assert not four.state.requires_grad
 
 
-def test_imagined_rewards_and_values_belong_to_the_states_they_are_of():
+@pytest.mark.parametrize("entropy", [0.0, 0.3])
+def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy):
     """The losses, spelled out along one trajectory."""
-    ours, batch = agent(trajectories=1), make_batch(1, 1)
+    ours, batch = agent(trajectories=1, actor_entropy=entropy), make_batch(1, 1)
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     torch.manual_seed(3)
     actor, critic = ours.control_losses(filtered, batch.mask)
@@ -137,8 +138,10 @@ def test_imagined_rewards_and_values_belong_to_the_states_they_are_of():
     torch.manual_seed(3)
     belief_samples(ours.model, filtered, 1)
     state, states = State(filtered.hidden[:, 0], filtered.state[:, 0]), []
+    nats = []
     for _ in range(4):
-        action, _ = ours.actor(torch.cat(state, -1)).rsample()
+        action, log_prob = ours.actor(torch.cat(state, -1)).rsample()
+        nats.append(-entropy * log_prob)
         rollout = ours.model.imagine(state, action[:, None])
         state = State(rollout.hidden[:, 0], rollout.state[:, 0])
         states.append(torch.cat(state, -1)[0])
@@ -148,9 +151,26 @@ def test_imagined_rewards_and_values_belong_to_the_states_they_are_of():
     second = r[1] + g * ((1 - l) * v[2] + l * third)
     first = r[0] + g * ((1 - l) * v[1] + l * second)
 
-    torch.testing.assert_close(actor, -(first + g * second + g**2 * third) / 3)
+    acting = (first + nats[0]) + g * (second + nats[1]) + g**2 * (third + nats[2])
+    torch.testing.assert_close(actor, -acting.squeeze() / 3)
     errors = [(value - target) ** 2 / 2 for value, target in zip(v, (first, second, third), strict=False)]
     torch.testing.assert_close(critic, (errors[0] + g * errors[1] + g**2 * errors[2]) / 3)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_reward_of_entropy_brings_an_actor_back_from_the_border(side):
+    """Where mean and spread say +-1 without a doubt, what the action earns has no slope left."""
+    ours, batch = agent(trajectories=1), make_batch()
+    with torch.no_grad():
+        ours.actor.head.weight.zero_()
+        ours.actor.head.bias.copy_(torch.tensor([side * 14.0, -14.0]))  # mean 4.96, standard deviation 2e-4
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    slope = {}
+    for ours.actor_entropy in (0.0, 1e-2):
+        loss, _ = ours.control_losses(filtered, batch.mask)
+        slope[ours.actor_entropy] = side * torch.autograd.grad(loss, ours.actor.head.bias)[0][0]
+
+    assert slope[1e-2] > 10 * abs(slope[0.0])
 
 
 def test_what_lies_on_padding_changes_nothing_of_thecontrol_losses():
@@ -195,6 +215,7 @@ def test_learns_the_action_that_pays(belief, trajectories):
     [
         ({"trajectories": 0}, "trajectories is 0, expected at least 1"),
         ({"horizon": 1}, "horizon is 1, expected at least 2"),
+        ({"actor_entropy": -1.0}, "actor_entropy is -1.0, expected at least 0"),
         ({"actor_rate": float("nan")}, "actor_rate is nan, expected at least 0"),
         ({"reward_std": 0.0}, "reward_std is 0.0, expected a number above 0"),
         ({"action_dim": 0}, "the data have no actions"),
