@@ -45,7 +45,7 @@ COMMANDS = {
     ),
     "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.figures.commands:main"),
     "data": Command(
-        "fetch, build, collect and look at data", "show strokes -o strokes.png", "forbes.data.commands:main"
+        "fetch, build, collect and look at data", "show strokes -o strokes.png", "forbes.training.collect_command:main"
     ),
     "doctor": Command("say what this machine has and lacks", "", "forbes.doctor:main"),
 }

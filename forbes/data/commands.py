@@ -4,7 +4,7 @@ import argparse
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import torch
@@ -28,6 +28,9 @@ from forbes.errors import ForbesError
 
 __all__ = ["build_classifiers", "build_strokes", "compare_strokes", "fetch", "main", "show"]
 
+Add: TypeAlias = Callable[[str, Callable[..., Any], str], argparse.ArgumentParser]
+"""Adds a command: its name, its function and an example."""
+AddMore: TypeAlias = Callable[[Add], None]
 Dataset = Literal["strokes"]
 Origin = Literal["bundled", "dejong"]
 
@@ -157,19 +160,20 @@ def _draw_digit(row: Sequence[Axes], points: NDArray[np.int_], pen_up: NDArray[n
         axis.set(xlim=(-0.5, SIDE - 0.5), ylim=(SIDE - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
 
 
-def main(argv: list[str]) -> int | None:
+def main(argv: list[str], add_more: AddMore) -> int | None:
     """Run `forbes data …`; 1 where `check` has found damage.
 
     Args:
         argv: What follows `forbes data` on the command line.
+        add_more: Adds the commands of who knows more than the data, by what it is called with.
     """
-    arguments = vars(_parser().parse_args(argv))
+    arguments = vars(_parser(add_more).parse_args(argv))
     command = arguments.pop("command")
     status: int | None = command(**arguments)
     return status
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(add_more: AddMore) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="forbes data",
         description="Build, fetch, compare, collect and look at the data.",
@@ -209,5 +213,6 @@ def _parser() -> argparse.ArgumentParser:
     look.add_argument("--origin", choices=get_args(Origin), default="bundled", help="set of strokes")
     look.add_argument("--path", type=Path, help="read this stroke file instead of the origin's own")
 
+    add_more(add)
     add_episode_commands(add)
     return parser

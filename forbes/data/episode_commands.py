@@ -1,4 +1,4 @@
-"""`forbes data collect`, `info` and `check`: episodes of an environment, played, counted and verified."""
+"""`forbes data info` and `check`: the episodes of an environment, counted and verified."""
 
 import argparse
 from collections import Counter
@@ -7,44 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import track
 
-from forbes.arguments import positive
-from forbes.data.collection import MakePolicy, collect_episodes, random_policy
 from forbes.data.episode_store import EpisodeStore, EpisodeWriter
 from forbes.data.episodes import EpisodeRecord
 from forbes.data.pictures import draw_strips, save_picture
-from forbes.envs import EnvironmentProcess, find_environment
-from forbes.envs.tasks import TASKS
 from forbes.errors import ForbesError
 
-__all__ = ["add_episode_commands", "check", "collect", "info"]
-
-POLICIES: dict[str, MakePolicy] = {"random": random_policy}
-
-
-def collect(task: str, episodes: int, policy: str, output: Path, seed: int, timeout: float, **options: Any) -> None:
-    """Play episodes in a process of its own, and store them; interrupted, it goes on where it stopped.
-
-    Args:
-        task: as `forbes.envs.tasks.TASKS` says.
-        episodes: how many have been stored in the end, those of earlier calls included.
-        policy: who acts.
-        output: folder of the store.
-        seed: episode n is a function of (seed, n).
-        timeout: seconds for each answer of the environment.
-        options: of the environment's constructor; None leaves its default.
-    """
-    given = {name: value for name, value in options.items() if value is not None}
-    make = find_environment(task, **given)
-    records: list[EpisodeRecord] = []
-    with EpisodeWriter(output) as writer:
-        missing = episodes - writer.watermark
-        if missing > 0:
-            with EnvironmentProcess(make, timeout) as environment:
-                played = collect_episodes(environment, writer, POLICIES[policy], policy, episodes, seed)
-                records += track(played, f"Playing {task}", total=missing)
-    print(f"{output}: {len(records)} episodes stored, {_counts(records)}; {writer.watermark} in all")
+__all__ = ["add_episode_commands", "check", "count_steps", "info"]
 
 
 def info(path: Path, output: Path | None = None) -> None:
@@ -80,7 +49,7 @@ def _facts(store: EpisodeStore, records: list[EpisodeRecord]) -> list[tuple[str,
             "episodes",
             f"{len(records)}, of {store.watermark} ever stored; {sum(r.terminated for r in records)} terminated",
         ),
-        ("steps", _counts(records)),
+        ("steps", count_steps(records)),
         ("on the disk", f"{sum(record.size for record in records) / 2**20:.1f} MiB"),
         ("return", _spread(returns)),
     ]
@@ -117,7 +86,7 @@ def _opened(path: Path) -> EpisodeStore:
     return store
 
 
-def _counts(records: list[EpisodeRecord]) -> str:
+def count_steps(records: list[EpisodeRecord]) -> str:
     """Keep the two kinds of steps apart."""
     steps, frames = sum(record.steps for record in records), sum(record.frames for record in records)
     return f"{steps:,} agent steps, {frames:,} env steps (frames, with action repeat)"
@@ -129,22 +98,6 @@ def _spread(values: Any) -> str:
 
 def add_episode_commands(add: Callable[[str, Callable[..., Any], str], argparse.ArgumentParser]) -> None:
     """Add the commands to those of `forbes data`."""
-    example = "collect --task cartpole_swingup --episodes 40 -o episodes/cartpole"
-    play = add("collect", collect, example)
-    play.formatter_class = argparse.RawDescriptionHelpFormatter
-    play.epilog = f"tasks:\n{TASKS}\n\n{play.epilog}"
-    play.add_argument("--task", required=True, help="see below")
-    play.add_argument("--episodes", type=positive, default=10, help="how many DIR has had in the end (10)")
-    play.add_argument("--policy", choices=POLICIES, default="random", help="who acts")
-    play.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the episodes")
-    play.add_argument("--seed", type=int, default=0, help="episode n is a function of the seed and n")
-    play.add_argument("--action-repeat", type=positive, help="frames for which an action is held")
-    play.add_argument("--pixels", action=argparse.BooleanOptionalAction, help="observe images, or what is measured")
-    play.add_argument("--size", type=positive, help="pixels a side (64)")
-    play.add_argument("--camera", type=int, help="number of the camera")
-    play.add_argument("--fast", action="store_const", const=True, help="no shadows: other pixels")
-    play.add_argument("--timeout", type=float, default=60.0, help="seconds for an answer of the environment (60)")
-
     look = add("info", info, "info episodes/cartpole")
     look.add_argument("path", type=Path, metavar="DIR", help="folder of the episodes")
     look.add_argument("-o", "--output", type=Path, help="picture to write, by default DIR/frames.png")

@@ -3,7 +3,6 @@
 import itertools
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -21,11 +20,11 @@ from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.record import write_record
 from forbes.training.acting import ActingModel, play_measured
-from forbes.training.loading import load_run
+from forbes.training.loading import load_run, loaded_agent
 from forbes.training.provenance import commit
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["evaluate_agents", "is_agent", "loaded_agent", "play_test_episode"]
+__all__ = ["evaluate_agents", "is_agent", "play_test_episode"]
 
 
 class _Played(NamedTuple):
@@ -89,24 +88,6 @@ def _play(run: str, episodes: int, seed: int, device: str) -> _Played:
     with loaded_agent(run, device) as (agent, environment):
         returns = [play_test_episode(agent, environment, seed, k).total_reward for k in _counted(run, episodes)]
         return _Played(run, agent, torch.tensor(returns, dtype=torch.float64), describe_environment(environment))
-
-
-@contextmanager
-def loaded_agent(run: str, device: str) -> Iterator[tuple[ActingModel, Environment]]:
-    """Load a run's agent on a device, with its environment, which is closed at the end.
-
-    Raises:
-        ForbesError: where the run is not an agent's.
-    """
-    module, data = load_run(run)
-    if not isinstance(module, ActingModel) or not isinstance(data.source, Experience):
-        kind = type(module).__name__
-        raise ForbesError(f"{run}: not the run of an agent, but of a {kind}. Name an agent's, or measure it by itself")
-    module.to(device)
-    try:
-        yield module, data.source.environment
-    finally:
-        data.source.close()
 
 
 def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int) -> Episode:

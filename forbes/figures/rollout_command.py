@@ -5,11 +5,12 @@ from pathlib import Path
 
 from forbes.arguments import ArgumentParser, positive
 from forbes.errors import ForbesError
-from forbes.evaluation.agents import loaded_agent, play_test_episode
+from forbes.evaluation.agents import play_test_episode
 from forbes.evaluation.runs import find_device
 from forbes.figures.grids import require_images
 from forbes.figures.video import gif
 from forbes.files import replace_file
+from forbes.training.loading import loaded_agent
 
 __all__ = ["main"]
 

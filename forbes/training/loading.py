@@ -1,7 +1,8 @@
 """Load what a run has learned: the model and the data of its configuration, with the weights of its last checkpoint."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -9,8 +10,10 @@ import yaml
 from lightning import LightningModule
 from torch import Tensor, nn
 
-from forbes.data import SequenceDataModule
+from forbes.data import Experience, SequenceDataModule
+from forbes.envs import Environment
 from forbes.errors import ForbesError
+from forbes.training.acting import ActingModel
 from forbes.training.checkpoint import read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside
 from forbes.training.configuration import allow_modules, experiment_parser
@@ -18,7 +21,7 @@ from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder
 from forbes.training.world_model import WorldModel
 
-__all__ = ["check_weights", "load_known_belief", "load_run"]
+__all__ = ["check_weights", "load_known_belief", "load_run", "loaded_agent"]
 
 Module = TypeVar("Module", bound=LightningModule)
 
@@ -62,6 +65,24 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
     check_weights(built.model, state, str(folder.checkpoint))
     built.model.load_state_dict(state)
     return built.model.eval(), built.data
+
+
+@contextmanager
+def loaded_agent(run: str, device: str) -> Iterator[tuple[ActingModel, Environment]]:
+    """Load a run's agent on a device, with its environment, which is closed at the end.
+
+    Raises:
+        ForbesError: where the run is not an agent's.
+    """
+    module, data = load_run(run)
+    if not isinstance(module, ActingModel) or not isinstance(data.source, Experience):
+        kind = type(module).__name__
+        raise ForbesError(f"{run}: not the run of an agent, but of a {kind}. Name an agent's, or measure it by itself")
+    module.to(device)
+    try:
+        yield module, data.source.environment
+    finally:
+        data.source.close()
 
 
 def check_weights(model: nn.Module, state: Mapping[str, Tensor], name: str) -> None:
