@@ -262,7 +262,11 @@ SHORT_EPISODES = {  # what an agent's configuration spends on playing
     "iterations: 5": "iterations: 1",
     "{class_path: Collect}": "{class_path: Collect, init_args: {seed_episodes: 1}}",
 }
-OVERLAYS = {"debug.yaml": "strokes/forbes.yaml", "dmc/cpu.yaml": "dmc/dreamer.yaml"}
+OVERLAYS = {
+    "debug.yaml": "strokes/forbes.yaml",
+    "dmc/cpu.yaml": "dmc/dreamer.yaml",
+    "dmc/world_model_cpu.yaml": "dmc/world_model_rssm.yaml",
+}
 
 
 @pytest.fixture(scope="session")
@@ -285,7 +289,7 @@ def test_every_configuration_trains(config, in_tmp_path, screens):
     elsewhere = {"data.source.origin": "bundled"} if "origin: dejong" in text else {}  # it is not in the repository
     if name.startswith("dmc/"):
         elsewhere = {"data.length": 6, "trainer.max_epochs": 2}
-        elsewhere |= {"data.source.path": screens} if "Replay" in text else {"data.source.task": "Screen"}
+        elsewhere |= {"data.source.path": screens} if "world_model" in name else {"data.source.task": "Screen"}
         elsewhere |= {"model.candidates": 20, "model.best": 5} if "PlanningAgent" in text else {}
     small = {
         "data.batch_size": 4,
