@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from forbes.models.networks import perceptron
+from forbes.models.networks import Perceptron
 
 __all__ = ["Actor", "ScalarHead", "TanhNormal"]
 
@@ -59,7 +59,7 @@ class Actor(nn.Module):
 
     def __init__(self, feature_dim: int, action_dim: int, width: int, layers: int) -> None:
         super().__init__()
-        self.hidden = perceptron(feature_dim, width, layers)
+        self.hidden = Perceptron(feature_dim, width, layers)
         self.head = nn.Linear(width, 2 * action_dim)
 
     def forward(self, features: Tensor) -> TanhNormal:
@@ -79,7 +79,7 @@ class ScalarHead(nn.Module):
 
     def __init__(self, feature_dim: int, width: int, layers: int) -> None:
         super().__init__()
-        self.net = nn.Sequential(perceptron(feature_dim, width, layers), nn.Linear(width, 1))
+        self.net = nn.Sequential(Perceptron(feature_dim, width, layers), nn.Linear(width, 1))
 
     def forward(self, features: Tensor) -> Tensor:
         """Give the number, `(*, F)` to `(*)`."""

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from forbes.beliefs import BeliefFamily
 from forbes.models.elbo import ElboTerms
 from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import Decoder, Encoder, perceptron
+from forbes.models.networks import Decoder, Encoder, Perceptron
 
 __all__ = ["BeliefModel", "ModelFamily", "Prediction", "Rollout", "Seen", "State"]
 
@@ -100,7 +100,7 @@ class BeliefModel(nn.Module, ABC):
         super().__init__()
         self.hidden_dim = hidden_dim
         self.encoder, self.decoder, self.likelihood = encoder, decoder, likelihood
-        self.transition = perceptron(input_dim, mlp_dim, mlp_layers)
+        self.transition = Perceptron(input_dim, mlp_dim, mlp_layers)
         self.gru = nn.GRUCell(mlp_dim, hidden_dim)
         self.register_buffer("center", None)
 

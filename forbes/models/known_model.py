@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from forbes.beliefs import BeliefFamily, BeliefHead
 from forbes.models.elbo import ElboTerms
-from forbes.models.networks import perceptron
+from forbes.models.networks import Perceptron
 
 __all__ = ["Densities", "KnownModel", "LearnedBelief", "Units"]
 
@@ -117,7 +117,7 @@ class KnownModel(nn.Module):
         super().__init__()
         self.process, self.of_state, self.of_input = process, of_state, of_input
         self.gru = nn.GRU(len(of_input.mean), hidden_dim, batch_first=True)
-        self.context = perceptron(hidden_dim, mlp_dim, mlp_layers)
+        self.context = Perceptron(hidden_dim, mlp_dim, mlp_layers)
         self.head: BeliefHead = belief(len(of_state.mean), mlp_dim)
 
     def belief(self, observation: Tensor, action: Tensor) -> LearnedBelief:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from itertools import pairwise
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -11,14 +11,46 @@ from torch import Tensor, nn
 from forbes.deferred import Loop
 from forbes.errors import ForbesError
 
-__all__ = ["ConvDecoder", "ConvEncoder", "Decoder", "Encoder", "MLPDecoder", "MLPEncoder", "bind_gru", "perceptron"]
+__all__ = [
+    "ConvDecoder",
+    "ConvEncoder",
+    "Decoder",
+    "Encoder",
+    "MLPDecoder",
+    "MLPEncoder",
+    "Perceptron",
+    "activate",
+    "bind_gru",
+]
+
+Activation: TypeAlias = Literal["relu", "elu"]
+_ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU}
 
 
-def perceptron(input_dim: int, width: int, layers: int) -> nn.Sequential:
-    """Build `layers` linear layers of `width`, each followed by a ReLU."""
-    dims = [input_dim] + [width] * layers
-    blocks = [nn.Sequential(nn.Linear(a, b), nn.ReLU()) for a, b in pairwise(dims)]
-    return nn.Sequential(*blocks)
+class Perceptron(nn.Sequential):
+    """`layers` linear layers of `width`, each followed by the activation: a ReLU, until `activate` says otherwise."""
+
+    def __init__(self, input_dim: int, width: int, layers: int) -> None:
+        dims = [input_dim] + [width] * layers
+        super().__init__(*(nn.Sequential(nn.Linear(a, b), nn.ReLU()) for a, b in pairwise(dims)))
+
+    @property
+    def linear(self) -> list[nn.Linear]:
+        """The linear layers alone."""
+        return [layer for layer in self.modules() if isinstance(layer, nn.Linear)]
+
+    @property
+    def activation(self) -> nn.Module:
+        """What follows each of them."""
+        return self.get_submodule("0.1")
+
+
+def activate(module: nn.Module, activation: Activation) -> None:
+    """Give every perceptron of a module another activation."""
+    for part in module.modules():
+        if isinstance(part, Perceptron):
+            for block in part.children():
+                block.add_module("1", _ACTIVATIONS[activation]())
 
 
 def bind_gru(cell: nn.GRUCell, loop: Loop) -> Callable[[Tensor, Tensor], Tensor]:
@@ -72,7 +104,7 @@ class MLPEncoder(Encoder):
     def __init__(self, observation_shape: tuple[int, ...], width: int = 200, layers: int = 2) -> None:
         super().__init__()
         self.embedding_dim = width
-        self.net = perceptron(math.prod(observation_shape), width, layers)
+        self.net = Perceptron(math.prod(observation_shape), width, layers)
 
     def forward(self, observation: Tensor) -> Tensor:
         """See `Encoder`."""
@@ -105,7 +137,7 @@ class MLPDecoder(Decoder):
         last = nn.Linear(width, math.prod(observation_shape))
         if output_bias:
             nn.init.constant_(last.bias, output_bias)
-        self.net = nn.Sequential(perceptron(feature_dim, width, layers), last)
+        self.net = nn.Sequential(Perceptron(feature_dim, width, layers), last)
 
     def forward(self, features: Tensor) -> Tensor:
         """See `Decoder`."""

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import linear
 
 from forbes.beliefs import BeliefFamily, BeliefHead
@@ -22,7 +22,7 @@ from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
 from forbes.models.elbo import ElboTerms
 from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import Decoder, Encoder, bind_gru, perceptron
+from forbes.models.networks import Decoder, Encoder, Perceptron, bind_gru
 from forbes.precision import full_precision
 
 __all__ = ["Filtered", "StateSpaceModel"]
@@ -83,8 +83,8 @@ class StateSpaceModel(BeliefModel):
             raise ForbesError(f"{type(self).__name__}: state_dim is {state_dim}, expected at least 1")
         super().__init__(encoder, decoder, likelihood, state_dim + action_dim, hidden_dim, mlp_dim, mlp_layers)
         self.action_dim, self.state_dim = action_dim, state_dim
-        self.prior_context = perceptron(hidden_dim, mlp_dim, mlp_layers)
-        self.posterior_context = perceptron(hidden_dim + encoder.embedding_dim, mlp_dim, mlp_layers)
+        self.prior_context = Perceptron(hidden_dim, mlp_dim, mlp_layers)
+        self.posterior_context = Perceptron(hidden_dim + encoder.embedding_dim, mlp_dim, mlp_layers)
         self.prior: BeliefHead = (prior or belief)(state_dim, mlp_dim)
         self.posterior: BeliefHead = belief(state_dim, mlp_dim)
 
@@ -206,25 +206,26 @@ class StateSpaceModel(BeliefModel):
         return ElboTerms(reconstruction, kl, analytic_kl, mask)
 
     @staticmethod
-    def _bind(network: nn.Sequential, known: Tensor, loop: Loop) -> Affine:
+    def _bind(network: Perceptron, known: Tensor, loop: Loop) -> Affine:
         """Bind a perceptron of [x, known] to a loop over x; the share of what is known is one matmul over all steps.
 
         Args:
-            network: a `perceptron`.
+            network: of it.
             known: the inputs that do not depend on the recurrence, `(B, T, K)`.
             loop: to bind it to; its batch is N copies of these B sequences.
         """
-        first, *others = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+        first, *others = network.linear
         cut = first.in_features - known.shape[-1]
         of_loop, of_known = first.weight[:, :cut], first.weight[:, cut:]  # (M, cut), (M, K)
         share = linear(known.transpose(0, 1), of_known, first.bias)  # (T, B, M)
         copies = share[:, None].expand(-1, loop.batch // len(known), -1, -1).flatten(1, 2)  # (T, N B, M)
         layers = [loop.affine(of_loop, copies)]
         layers += [loop.affine(layer.weight, layer.bias) for layer in others]
+        activation = network.activation
 
         def run(x: Tensor) -> Tensor:
             for layer in layers:
-                x = layer(x).relu()
+                x = activation(layer(x))
             return x
 
         return run

@@ -17,6 +17,7 @@ from forbes.envs import Environment
 from forbes.errors import ForbesError
 from forbes.models import Filtered, StateSpaceModel
 from forbes.models.elbo import ElboTerms
+from forbes.models.networks import activate
 from forbes.training.world_model import WorldModel, require_at_least
 
 __all__ = ["Acting", "ActingModel", "play_measured"]
@@ -63,6 +64,7 @@ class ActingModel(WorldModel, ABC):
             )
         self.exploration, self.reward_std = exploration, reward_std
         self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, reward_layers)
+        activate(self.reward, self.activation)
 
     @abstractmethod
     def choose(self, exploring: bool) -> Choice:

@@ -11,6 +11,7 @@ from forbes.control.policy import Actor, ScalarHead, TanhNormal
 from forbes.control.returns import actor_loss, critic_loss, lambda_returns
 from forbes.data import SequenceBatch
 from forbes.models import Filtered, State
+from forbes.models.networks import activate
 from forbes.training.acting import ActingModel
 from forbes.training.world_model import Group, require_at_least
 
@@ -71,6 +72,8 @@ class ImaginationActorCritic(ActingModel):
         features = self.model.hidden_dim + self.model.state_dim
         self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers)
         self.critic = ScalarHead(features, control_dim, critic_layers)
+        for network in (self.actor, self.critic):
+            activate(network, self.activation)
         self.trajectories, self.horizon, self.discount, self.lambda_ = trajectories, horizon, discount, lambda_
         self.actor_rate, self.critic_rate, self.actor_entropy = actor_rate, critic_rate, actor_entropy
 

@@ -15,7 +15,7 @@ from forbes.errors import ForbesError
 from forbes.models.base import ModelFamily
 from forbes.models.elbo import ElboTerms, FreeNats, elbo_loss
 from forbes.models.likelihoods import Likelihood, Normal, VectorNormal
-from forbes.models.networks import ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily
+from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
 
@@ -47,6 +47,7 @@ class WorldModel(LightningModule):
         hidden_dim: H of the GRU.
         mlp_dim: width of every perceptron.
         mlp_layers: layers of every perceptron.
+        activation: of every perceptron; convolutions and flows keep their ReLU.
         kl: "analytic" trains with the closed form where the family has one, "monte_carlo" never.
         free_nats: the KL below this, in nats per step, costs nothing in training.
         free_nats_per: "batch" applies them to the mean over batch and time, "element" to each step.
@@ -77,6 +78,7 @@ class WorldModel(LightningModule):
         hidden_dim: int = 200,
         mlp_dim: int = 200,
         mlp_layers: int = 2,
+        activation: Activation = "relu",
         kl: Literal["analytic", "monte_carlo"] = "analytic",
         free_nats: float = 3.0,
         free_nats_per: FreeNats = "batch",
@@ -103,6 +105,8 @@ class WorldModel(LightningModule):
             mlp_layers,
             prior,
         )
+        self.activation: Activation = activation
+        activate(self.model, activation)
         if center:
             _require_mean(self.model.likelihood)
             self.model.center = torch.zeros(observation_shape)

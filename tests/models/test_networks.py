@@ -6,7 +6,7 @@ from torch import nn
 
 from forbes.errors import ForbesError
 from forbes.models import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
-from forbes.models.networks import perceptron
+from forbes.models.networks import Perceptron, activate
 
 
 @pytest.mark.parametrize(("shape", "embedding_dim"), [((3, 64, 64), 1024), ((1, 28, 28), 128)])
@@ -61,10 +61,12 @@ def test_an_image_is_treated_alone_as_in_a_batch(network):
     torch.testing.assert_close(network(images[1:2]), network(images)[1:2])
 
 
-def test_perceptron_ends_with_a_relu():
-    network = perceptron(3, width=5, layers=2)
+@pytest.mark.parametrize(("activation", "lowest"), [("relu", 0), ("elu", -1)])
+def test_perceptron_ends_with_its_activation(activation, lowest):
+    network = Perceptron(3, width=5, layers=2)
+    activate(network, activation)
 
-    output = network(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)))
+    output = network(100 * torch.randn(100, 3, generator=torch.Generator().manual_seed(0)))
 
     assert output.shape == (100, 5)
-    assert output.min() == 0
+    assert output.min() == lowest

@@ -19,6 +19,7 @@ from small_models import (
 
 from forbes.beliefs import GaussianBelief
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, StateSpaceModel
+from forbes.models.networks import activate
 
 
 @pytest.fixture(params=STATE_SPACE, name="family")
@@ -41,8 +42,10 @@ def step_by_step(model, observation, action):
 
 
 @pytest.mark.usefixtures("same_noise")
-def test_the_bound_and_its_gradients_are_those_of_the_plain_loop(family):
+@pytest.mark.parametrize("activation", ["relu", "elu"])
+def test_the_bound_and_its_gradients_are_those_of_the_plain_loop(family, activation):
     model, (observation, action, mask) = random_model(family), sequences()
+    activate(model, activation)
 
     terms = model.elbo(observation, action, mask)
     reconstruction, kl = step_by_step(model, observation, action)

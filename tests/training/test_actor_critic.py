@@ -91,6 +91,13 @@ def test_actor_and_critic_learn_each_from_its_own_loss():
         assert all(gradient.abs().max() > 0 for gradient in gradients(loss, [getattr(ours, name)]))
 
 
+def test_the_activation_is_that_of_every_perceptron():
+    ours = agent(activation="elu")
+
+    assert not [name for name, part in ours.named_modules() if isinstance(part, torch.nn.ReLU)]
+    assert len([part for part in ours.modules() if isinstance(part, torch.nn.ELU)]) == 11
+
+
 def test_nothing_stays_frozen():
     ours = agent()
     loss_of(ours, make_batch())
