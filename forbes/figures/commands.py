@@ -1,11 +1,14 @@
 """`forbes figures`: the paper's figures from run folders."""
 
+import argparse
+import re
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 
 import pandas as pd
 import torch
+import yaml
 from matplotlib.figure import Figure
 
 from forbes.arguments import ArgumentParser, positive
@@ -14,9 +17,10 @@ from forbes.errors import ForbesError
 from forbes.evaluation.predictions import whole_sequences
 from forbes.evaluation.record import read_record
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable
+from forbes.figures.returns import returns_against_env_steps
 from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
 from forbes.figures.style import PALETTE, save_figure
-from forbes.training.run_folder import read_metrics
+from forbes.training.run_folder import RunFolder, read_metrics
 
 __all__ = ["main"]
 
@@ -24,6 +28,10 @@ _DESCRIPTION = """\
 Draw the paper's figures from run folders, each as PNG and PDF.
 
   forbes figures strokes --runs runs/compare/forbes-0 runs/compare/rssm-0 -o figures
+  forbes figures agents --runs runs/hike/forbes-{0,1,2} runs/hike/dreamer-{0,1,2} -o figures
+
+agents: returns, what agents of one task earn without exploration against env steps. Runs whose folders differ in the
+number at the end only are one curve, their mean and range; it is called as they are, forbes and dreamer here.
 
 strokes: predictions-t30 (Figure 4), the same rolled on to the end of the longest digit, and elbo (Figure 5). Runs that
 differ in their seed only are one family: Figure 4 shows the first of them, Figure 5 their mean and range. A family that
@@ -37,6 +45,14 @@ _FORMATS = (".png", ".pdf")
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = _parser().parse_args(argv)
+    if args.experiment == "agents":
+        _save(returns_against_env_steps(*_agents(args.runs)), args.output, "returns")
+    else:
+        _strokes(args)
+
+
+def _strokes(args: argparse.Namespace) -> None:
+    """Draw Figures 4 and 5."""
     runs = load_runs(args.runs)
     for run in runs:
         if not isinstance(run.data.source, Strokes):
@@ -57,7 +73,7 @@ def main(argv: Sequence[str]) -> None:
 
 def _parser() -> ArgumentParser:
     parser = ArgumentParser("forbes figures", _DESCRIPTION)
-    parser.add_argument("experiment", choices=["strokes"], help="whose figures")
+    parser.add_argument("experiment", choices=["strokes", "agents"], help="whose figures")
     parser.add_argument(
         "--runs", nargs="+", required=True, metavar="RUN", help="run folders that `forbes fit` has made"
     )
@@ -66,6 +82,23 @@ def _parser() -> ArgumentParser:
     parser.add_argument("--samples", type=positive, default=6, help="completions of each digit (default: 6)")
     parser.add_argument("--context", type=positive, default=15, help="frames that the models see (default: 15)")
     return parser
+
+
+def _agents(runs: Sequence[str]) -> tuple[str, dict[str, list[pd.Series]]]:
+    """Give the task of agents, and by name the curves of their returns, one for each seed."""
+    curves: dict[str, list[pd.Series]] = {}
+    tasks = set()
+    for run in runs:
+        metrics = read_metrics(run)
+        if "return/acting" not in metrics:
+            raise ForbesError(f"{run}: metrics.jsonl has no return/acting. Name runs of agents that were measured")
+        source = yaml.safe_load(RunFolder(run).config.read_text())["data"]["init_args"]["source"]
+        tasks.add(source["init_args"]["task"])
+        name = re.sub(r"-\d+$", "", Path(run).resolve().name)
+        curves.setdefault(name, []).append(metrics.set_index("env_steps")["return/acting"].dropna())
+    if len(tasks) > 1:
+        raise ForbesError(f"--runs: they are of {' and '.join(sorted(tasks))}, expected one task. Draw each by itself")
+    return tasks.pop(), curves
 
 
 def group(runs: Sequence[TrainedRun]) -> list[Family]:

@@ -5,13 +5,14 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle
 
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from forbes.errors import ForbesError
 from forbes.figures.style import COLUMN, GREY, ORANGE, PALETTE, draw_range, paper_style
 
-__all__ = ["published_curves", "return_curve"]
+__all__ = ["published_curves", "return_curve", "returns_against_env_steps"]
 
 
 def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Sequence[pd.Series]]) -> Figure:
@@ -28,17 +29,41 @@ def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Seque
         figure = Figure((COLUMN, 2.3), layout="constrained")
         axes = figure.subplots()
         for (method, curves), colour in zip(published.items(), cycle((ORANGE, *PALETTE[2:])), strict=False):
-            # Seeds that were measured at different steps meet at all of them.
-            seeds = pd.concat(curves, axis=1).interpolate("index", limit_area="inside").dropna()
-            draw_range(axes, seeds, colour, f"{method}, published, {len(curves)} seeds")
+            draw_range(axes, _joined(curves), colour, f"{method}, published, {len(curves)} seeds")
         axes.plot(exploring.index, exploring, color=GREY, lw=0.6, label="exploring")
         axes.plot(acting.index, acting, ".-", color=PALETTE[0], markersize=3, label="acting, without exploration")
-        axes.set(xlabel="env steps (frames)", ylabel="return of an episode", title=task)
-        axes.set_xlim(0, 1.02 * table.index.max())
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
-        axes.locator_params("x", nbins=6)
-        axes.legend(loc="best")
+        _label(axes, task, table.index.max())
     return figure
+
+
+def returns_against_env_steps(task: str, agents: Mapping[str, Sequence[pd.Series]]) -> Figure:
+    """Draw what agents earn without exploration: mean and range over seeds, at the steps that all seeds have reached.
+
+    Args:
+        task: the title.
+        agents: by name, a curve for each seed, returns against env steps.
+    """
+    with paper_style():
+        figure = Figure((COLUMN, 2.6), layout="constrained")
+        axes = figure.subplots()
+        for (name, curves), colour in zip(agents.items(), cycle(PALETTE), strict=False):
+            label = name if len(curves) == 1 else f"{name}, {len(curves)} seeds"
+            draw_range(axes, _joined(curves), colour, label)
+        _label(axes, task, max(curve.index.max() for curves in agents.values() for curve in curves))
+    return figure
+
+
+def _joined(curves: Sequence[pd.Series]) -> pd.DataFrame:
+    """Let seeds that were measured at different steps meet at all of them."""
+    return pd.concat(curves, axis=1).sort_index().interpolate("index", limit_area="inside").dropna()
+
+
+def _label(axes: Axes, task: str, end: float) -> None:
+    axes.set(xlabel="env steps (frames)", ylabel="return of an episode", title=task)
+    axes.set_xlim(0, 1.02 * end)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
+    axes.locator_params("x", nbins=6)
+    axes.legend(loc="best")
 
 
 def published_curves(path: str, task: str) -> dict[str, list[pd.Series]]:
