@@ -94,7 +94,7 @@ def _agents(runs: Sequence[str]) -> tuple[str, dict[str, list[pd.Series]]]:
             raise ForbesError(f"{run}: metrics.jsonl has no return/acting. Name runs of agents that were measured")
         source = yaml.safe_load(RunFolder(run).config.read_text())["data"]["init_args"]["source"]
         tasks.add(source["init_args"]["task"])
-        name = re.sub(r"-\d+$", "", Path(run).resolve().name)
+        name = re.sub(r"-\d+$", "", Path(run).absolute().name)
         curves.setdefault(name, []).append(metrics.set_index("env_steps")["return/acting"].dropna())
     if len(tasks) > 1:
         raise ForbesError(f"--runs: they are of {' and '.join(sorted(tasks))}, expected one task. Draw each by itself")
