@@ -160,20 +160,20 @@ def _draw_digit(row: Sequence[Axes], points: NDArray[np.int_], pen_up: NDArray[n
         axis.set(xlim=(-0.5, SIDE - 0.5), ylim=(SIDE - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
 
 
-def main(argv: list[str], add_more: AddMore) -> int | None:
+def main(argv: list[str], *more: AddMore) -> int | None:
     """Run `forbes data …`; 1 where `check` has found damage.
 
     Args:
         argv: What follows `forbes data` on the command line.
-        add_more: Adds the commands of who knows more than the data, by what it is called with.
+        more: Each adds commands of who knows more than the data.
     """
-    arguments = vars(_parser(add_more).parse_args(argv))
+    arguments = vars(_parser(more).parse_args(argv))
     command = arguments.pop("command")
     status: int | None = command(**arguments)
     return status
 
 
-def _parser(add_more: AddMore) -> argparse.ArgumentParser:
+def _parser(more: Sequence[AddMore]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="forbes data",
         description="Build, fetch, compare, collect and look at the data.",
@@ -213,6 +213,7 @@ def _parser(add_more: AddMore) -> argparse.ArgumentParser:
     look.add_argument("--origin", choices=get_args(Origin), default="bundled", help="set of strokes")
     look.add_argument("--path", type=Path, help="read this stroke file instead of the origin's own")
 
-    add_more(add)
+    for add_more in more:
+        add_more(add)
     add_episode_commands(add)
     return parser

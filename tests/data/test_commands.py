@@ -8,6 +8,7 @@ from forbes.data import commands
 from forbes.data.stroke_file import load_strokes, save_strokes
 from forbes.data.strokes import bundled_path
 from forbes.errors import ForbesError
+from forbes.training import collect_command
 
 
 @pytest.fixture
@@ -96,7 +97,7 @@ COMMANDS = ["build-strokes", "build-classifiers", "fetch", "compare-strokes", "s
 
 def test_help_has_an_example_of_every_command(capsys):
     with pytest.raises(SystemExit):
-        commands.main(["--help"])
+        collect_command.main(["--help"])
 
     examples = capsys.readouterr().out.partition("examples:")[2]
     assert [line.split()[2] for line in examples.splitlines() if line] == COMMANDS
@@ -105,7 +106,7 @@ def test_help_has_an_example_of_every_command(capsys):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_help_of_a_command_ends_with_an_example(command, capsys):
     with pytest.raises(SystemExit):
-        commands.main([command, "--help"])
+        collect_command.main([command, "--help"])
 
     assert f"example: forbes data {command} " in " ".join(capsys.readouterr().out.split())
 
