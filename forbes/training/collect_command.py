@@ -56,7 +56,7 @@ def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, M
     if policy != _RANDOM:
         if given:
             raise ForbesError(
-                f"--policy {policy}: an agent acts in the environment of its run, expected no --{min(given)}. "
+                f"--policy {policy}: an agent acts in the environment of its run, expected no --{min(given).replace('_', '-')}. "
                 "Leave it out"
             )
         with loaded_agent(policy, "cpu") as (agent, environment):

@@ -39,6 +39,7 @@ def test_an_agent_plays_what_its_training_would_have_played_next(run, tmp_path, 
     [
         (("--policy", "{run}", "--task", "Parrot"), "acts in the environment of its run, expected no --task"),
         (("--policy", "{run}", "--timeout", 3), "acts in the environment of its run, expected no --timeout"),
+        (("--policy", "{run}", "--action-repeat", 3), "expected no --action-repeat"),
         (("--policy", "{world}"), "not the run of an agent, but of a WorldModel"),
         (("--policy", "randon"), "randon"),
         ((), "--policy random: needs an environment. Name one: --task TASK"),
