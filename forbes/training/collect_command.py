@@ -55,9 +55,9 @@ def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, M
     """Give who acts, and where: an agent in the environment of its run."""
     if policy != _RANDOM:
         if given:
+            flag = "--" + min(given).replace("_", "-")
             raise ForbesError(
-                f"--policy {policy}: an agent acts in the environment of its run, expected no --{min(given).replace('_', '-')}. "
-                "Leave it out"
+                f"--policy {policy}: an agent acts in the environment of its run, expected no {flag}. Leave it out"
             )
         with loaded_agent(policy, "cpu") as (agent, environment):
             yield environment, Acting(agent, exploring=True)
