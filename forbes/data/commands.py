@@ -4,7 +4,7 @@ import argparse
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from rich.progress import track
 from forbes.data.classifier_training import classify, digits_of, quality, train_classifiers
 from forbes.data.dejong import dejong_path, verify_dejong
 from forbes.data.digit_classifiers import CLASSIFIERS_SHA256, classifiers_path, save_weights
-from forbes.data.episode_commands import add_episode_commands
+from forbes.data.episode_commands import Add, add_episode_commands
 from forbes.data.fetch import fetch_dejong
 from forbes.data.pictures import save_picture
 from forbes.data.source import Split
@@ -28,9 +28,6 @@ from forbes.errors import ForbesError
 
 __all__ = ["build_classifiers", "build_strokes", "compare_strokes", "fetch", "main", "show"]
 
-Add: TypeAlias = Callable[[str, Callable[..., Any], str], argparse.ArgumentParser]
-"""Adds a command: its name, its function and an example."""
-AddMore: TypeAlias = Callable[[Add], None]
 Dataset = Literal["strokes"]
 Origin = Literal["bundled", "dejong"]
 
@@ -160,7 +157,7 @@ def _draw_digit(row: Sequence[Axes], points: NDArray[np.int_], pen_up: NDArray[n
         axis.set(xlim=(-0.5, SIDE - 0.5), ylim=(SIDE - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
 
 
-def main(argv: list[str], *more: AddMore) -> int | None:
+def main(argv: list[str], *more: Callable[[Add], None]) -> int | None:
     """Run `forbes data …`; 1 where `check` has found damage.
 
     Args:
@@ -173,7 +170,7 @@ def main(argv: list[str], *more: AddMore) -> int | None:
     return status
 
 
-def _parser(more: Sequence[AddMore]) -> argparse.ArgumentParser:
+def _parser(more: Sequence[Callable[[Add], None]]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="forbes data",
         description="Build, fetch, compare, collect and look at the data.",
@@ -213,7 +210,6 @@ def _parser(more: Sequence[AddMore]) -> argparse.ArgumentParser:
     look.add_argument("--origin", choices=get_args(Origin), default="bundled", help="set of strokes")
     look.add_argument("--path", type=Path, help="read this stroke file instead of the origin's own")
 
-    for add_more in more:
-        add_more(add)
-    add_episode_commands(add)
+    for add_commands in (*more, add_episode_commands):
+        add_commands(add)
     return parser

@@ -4,7 +4,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -13,7 +13,10 @@ from forbes.data.episodes import EpisodeRecord
 from forbes.data.pictures import draw_strips, save_picture
 from forbes.errors import ForbesError
 
-__all__ = ["add_episode_commands", "check", "count_steps", "info"]
+__all__ = ["Add", "add_episode_commands", "check", "count_steps", "info"]
+
+Add: TypeAlias = Callable[[str, Callable[..., Any], str], argparse.ArgumentParser]
+"""Adds a command to `forbes data`: its name, its function and an example."""
 
 
 def info(path: Path, output: Path | None = None) -> None:
@@ -96,7 +99,7 @@ def _spread(values: Any) -> str:
     return f"{values.min():.3f} to {values.max():.3f}, mean {values.mean():.3f}"
 
 
-def add_episode_commands(add: Callable[[str, Callable[..., Any], str], argparse.ArgumentParser]) -> None:
+def add_episode_commands(add: Add) -> None:
     """Add the commands to those of `forbes data`."""
     look = add("info", info, "info episodes/cartpole")
     look.add_argument("path", type=Path, metavar="DIR", help="folder of the episodes")

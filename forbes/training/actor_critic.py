@@ -105,9 +105,11 @@ class ImaginationActorCritic(ActingModel):
             features = self.model.roll(start, act, self.horizon).features  # (N B T, H, F)
             returns = lambda_returns(self.reward(features), self.critic(features), self.discount, self.lambda_)
         value = self.critic(features[:, :-1].detach())  # (N B T, H - 1)
-        entropy = torch.stack(surprises[:-1], -1)  # (N B T, H - 1), of the action that led to each of these states
-        actor = actor_loss(returns + self.actor_entropy * entropy, self.discount, valid)
-        return actor, critic_loss(value, returns, self.discount, valid)
+        critic = critic_loss(value, returns, self.discount, valid)
+        if self.actor_entropy:  # else its gradient, of nothing, would cost 3 % of the imagination
+            entropy = torch.stack(surprises[:-1], -1)  # (N B T, H - 1), of the action that led to each of these states
+            returns = returns + self.actor_entropy * entropy
+        return actor_loss(returns, self.discount, valid), critic
 
     def groups(self) -> list[Group]:
         """See `WorldModel.groups`: three, so that no gradient is scaled down for another's sake."""

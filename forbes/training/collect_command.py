@@ -11,7 +11,7 @@ from rich.progress import track
 from forbes.arguments import positive
 from forbes.data import commands
 from forbes.data.collection import MakePolicy, collect_episodes, random_policy
-from forbes.data.episode_commands import count_steps
+from forbes.data.episode_commands import Add, count_steps
 from forbes.data.episode_store import EpisodeWriter
 from forbes.envs import Environment, EnvironmentProcess, find_environment
 from forbes.envs.tasks import TASKS
@@ -69,7 +69,7 @@ def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, M
             yield environment, random_policy
 
 
-def _add_collect(add: commands.Add) -> None:
+def _add_collect(add: Add) -> None:
     play = add("collect", collect, "collect --task cartpole_swingup --episodes 40 -o episodes/cartpole")
     play.formatter_class = argparse.RawDescriptionHelpFormatter
     play.epilog = (
