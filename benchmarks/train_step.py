@@ -60,7 +60,7 @@ def dmc(form: str, batch: int) -> tuple[WorldModel, SequenceBatch]:
     observation = torch.randint(256, (*shape, 3, 64, 64), dtype=torch.uint8)
     mask = torch.ones(shape, dtype=torch.bool)
     action, no_state = torch.rand(*shape, ACTIONS), torch.zeros(*shape, 0)
-    return world, SequenceBatch(observation, action, torch.zeros(shape), mask, no_state)
+    return world, SequenceBatch(observation, action, torch.zeros(shape), mask, no_state, ended=~mask)
 
 
 class Operations(TorchDispatchMode):

@@ -8,7 +8,7 @@ from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.deferred import Loop
 from forbes.errors import ForbesError
 
-__all__ = ["CategoricalBelief"]
+__all__ = ["CategoricalBelief", "draw_one_hot"]
 
 
 class CategoricalBelief(BeliefHead):
@@ -45,12 +45,12 @@ class CategoricalBelief(BeliefHead):
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """See `BeliefHead.rsample`; the gradient is straight-through."""
-        return _draw(self.log_probabilities(context), sample_shape)
+        return draw_one_hot(self.log_probabilities(context), sample_shape)
 
     def sampler(self, loop: Loop) -> Sampler:
         """See `BeliefHead.sampler`."""
         logits_of = loop.affine(self.logits_of.weight, self.logits_of.bias)
-        return lambda context: _draw(self._log_probabilities(logits_of(context)))
+        return lambda context: draw_one_hot(self._log_probabilities(logits_of(context)))
 
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
         """See `BeliefHead.log_prob`; of one-hot states."""
@@ -81,7 +81,16 @@ def _scale_gradient(x: Tensor, share: float) -> Tensor:
     return torch.lerp(x.detach(), x, share)
 
 
-def _draw(log_probability: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+def draw_one_hot(log_probability: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+    """Draw one-hot variables, with straight-through gradients, and the log-probability of all of a row in nats.
+
+    Args:
+        log_probability: log π, `(*, G, K)`.
+        sample_shape: of independent draws.
+
+    Returns:
+        The variables side by side, `(*sample_shape, *, G K)`, and `(*sample_shape, *)`.
+    """
     # The largest of log π - log E, E exponential, is at k with probability π_k: no call that waits for the device.
     shape = (*sample_shape, *log_probability.shape)  # (*sample_shape, *, G, K)
     race = log_probability.new_empty(shape).exponential_().log()

@@ -7,16 +7,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from forbes.control.planning import CrossEntropy, plan
-from forbes.control.policy import Actor, TanhNormal
+from forbes.control.policy import Actor, Policy
 from forbes.models import Filtered, State, StateSpaceModel
 from forbes.seeding import derive_seed
 
 __all__ = ["Agent", "Choice", "explore", "follow_plan", "noisy", "take_mode"]
 
 Choice: TypeAlias = Callable[[Filtered], Tensor]
-"""What to do at the last step of a filtered history, `(1, 1, …)`: an action, `(1, A)`, in [-1, 1]."""
+"""What to do at the last step of a filtered history, `(1, 1, …)`: an action, `(1, A)`, in [-1, 1] or one-hot."""
 
 
 class Agent:
@@ -53,20 +54,25 @@ def take_mode(actor: Actor) -> Choice:
     """Take the most probable action, as for an evaluation."""
 
     def choose(filtered: Filtered) -> Tensor:
-        policy: TanhNormal = actor(filtered.features[:, 0])
+        policy: Policy = actor(filtered.features[:, 0])
         return policy.mode()
 
     return choose
 
 
-def explore(actor: Actor, noise: float) -> Choice:
-    """Draw from the policy, and add noise: how Dreamer collects."""
+def explore(actor: Actor, amount: float) -> Choice:
+    """Draw from the policy, and stray from it: how Dreamer collects.
+
+    Args:
+        actor: chooses.
+        amount: standard deviation of the noise, or, where actions are discrete, how often one is replaced by any.
+    """
 
     def choose(filtered: Filtered) -> Tensor:
-        policy: TanhNormal = actor(filtered.features[:, 0])
+        policy: Policy = actor(filtered.features[:, 0])
         return policy.rsample()[0]
 
-    return noisy(choose, noise)
+    return _sometimes_any(choose, amount) if actor.discrete else noisy(choose, amount)
 
 
 def noisy(choose: Choice, noise: float) -> Choice:
@@ -77,6 +83,18 @@ def noisy(choose: Choice, noise: float) -> Choice:
         return (action + noise * torch.randn_like(action)).clamp(-1, 1)
 
     return choose_nearby
+
+
+def _sometimes_any(choose: Choice, chance: float) -> Choice:
+    """Replace a discrete choice by one of all alike, with a probability (ε-greedy)."""
+
+    def choose_or_draw(filtered: Filtered) -> Tensor:
+        action = choose(filtered)  # (1, A)
+        actions = action.shape[-1]
+        drawn = one_hot(torch.randint(actions, (len(action),), device=action.device), actions)  # (1, A)
+        return torch.where(torch.rand(len(action), 1, device=action.device) < chance, drawn.to(action), action)
+
+    return choose_or_draw
 
 
 def follow_plan(model: StateSpaceModel, reward: Callable[[Tensor], Tensor], search: CrossEntropy) -> Choice:

@@ -1,17 +1,29 @@
 """Actor, critic and reward on the features of a belief sample (paper §3.2, appendix; the actor's head is Dreamer's)."""
 
 import math
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import softplus
+from torch.nn.functional import one_hot, softplus
 
+from forbes.beliefs.categorical import draw_one_hot
 from forbes.models.networks import Perceptron
 
-__all__ = ["Actor", "ScalarHead", "TanhNormal"]
+__all__ = ["Actor", "OneHotCategorical", "Policy", "ScalarHead", "TanhNormal"]
 
 _MODE_SAMPLES = 100
 _LOG_2 = math.log(2.0)
+
+
+class Policy(Protocol):
+    """A distribution over actions, with batch shape `(*)`."""
+
+    def rsample(self) -> tuple[Tensor, Tensor]:
+        """Draw an action with a gradient, and its log-probability in nats: `(*, A)` and `(*)`."""
+
+    def mode(self) -> Tensor:
+        """Give the most probable action, `(*, A)`."""
 
 
 class TanhNormal:
@@ -45,8 +57,31 @@ class TanhNormal:
         return action.gather(0, best[None, ..., None].expand(1, *action.shape[1:])).squeeze(0)  # (*, A)
 
 
+class OneHotCategorical:
+    r"""One of A actions, one-hot: :math:`\log p(a) = \sum_i a_i \log \mathrm{softmax}(x)_i`.
+
+    Gradients are straight-through, :math:`\partial a := \partial p` (DreamerV2, arXiv 2010.02193): biased where what
+    follows is not linear in the action, exact for the entropy as the mean of :math:`-\log p(a)`.
+
+    Args:
+        logits: x, `(*, A)`.
+    """
+
+    def __init__(self, logits: Tensor) -> None:
+        self.log_probability = logits.log_softmax(-1)  # (*, A)
+
+    def rsample(self) -> tuple[Tensor, Tensor]:
+        """See `Policy.rsample`."""
+        return draw_one_hot(self.log_probability.unsqueeze(-2))  # of (*, 1, A), one variable
+
+    def mode(self) -> Tensor:
+        """See `Policy.mode`."""
+        best = one_hot(self.log_probability.argmax(-1), self.log_probability.shape[-1])  # (*, A)
+        return best.to(self.log_probability.dtype)
+
+
 class Actor(nn.Module):
-    r"""The policy q(a | features): a tanh-normal, almost bang-bang at the start (Dreamer, appendix A).
+    r"""The policy q(a | features): a tanh-normal, almost bang-bang at the start (Dreamer, appendix A), of vectors.
 
     .. math:: \mu = 5 \tanh(x / 5), \qquad \sigma = \mathrm{softplus}(y + \log(e^5 - 1)) + 10^{-4}
 
@@ -55,16 +90,21 @@ class Actor(nn.Module):
         action_dim: A.
         width: of each hidden layer.
         layers: hidden layers.
+        discrete: an action is one of A, one-hot, and the policy a categorical.
     """
 
-    def __init__(self, feature_dim: int, action_dim: int, width: int, layers: int) -> None:
+    def __init__(self, feature_dim: int, action_dim: int, width: int, layers: int, discrete: bool = False) -> None:
         super().__init__()
+        self.discrete = discrete
         self.hidden = Perceptron(feature_dim, width, layers)
-        self.head = nn.Linear(width, 2 * action_dim)
+        self.head = nn.Linear(width, action_dim if discrete else 2 * action_dim)
 
-    def forward(self, features: Tensor) -> TanhNormal:
+    def forward(self, features: Tensor) -> Policy:
         """Give the policy at features, `(*, F)`."""
-        mean, std = self.head(self.hidden(features)).chunk(2, -1)  # 2 x (*, A)
+        numbers: Tensor = self.head(self.hidden(features))
+        if self.discrete:
+            return OneHotCategorical(numbers)
+        mean, std = numbers.chunk(2, -1)  # 2 x (*, A)
         return TanhNormal(5 * torch.tanh(mean / 5), softplus(std + math.log(math.expm1(5))) + 1e-4)
 
 

@@ -93,6 +93,11 @@ class SequenceDataModule(LightningDataModule):
         """A."""
         return self.source.action_dim
 
+    @property
+    def discrete(self) -> bool:
+        """Whether an action is one of A, as a one-hot vector."""
+        return self.source.discrete
+
     def state_dict(self) -> dict[str, Any]:
         """Give what a checkpoint must hold for the same batches: how far a growing source was read."""
         return {} if self.source.watermark is None else {"watermark": self.source.watermark}

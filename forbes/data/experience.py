@@ -60,6 +60,11 @@ class Experience(SequenceSource):
         """See `SequenceSource`."""
         return self.environment.action_dim
 
+    @property
+    def discrete(self) -> bool:  # type: ignore[override]
+        """See `SequenceSource`."""
+        return self.environment.discrete
+
     def open(self, folder: Path) -> None:
         """Keep the episodes in a folder, which no other process may write to until `close`."""
         self._writer = EpisodeWriter(folder).__enter__()

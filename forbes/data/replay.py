@@ -28,6 +28,8 @@ class Windows(NamedTuple):
     """r_t, float32 (B, T)."""
     mask: Tensor
     """False on padding, bool (B, T)."""
+    ended: Tensor
+    """True on the last step of an episode that a process has ended, bool (B, T)."""
 
 
 class _Table(NamedTuple):
@@ -78,6 +80,7 @@ class Replay(SequenceSource):
         environment = next(iter(self.store.records.values())).environment
         self.observation_shape: tuple[int, ...] = tuple(environment["observation_shape"])
         self.action_dim: int = environment["action_dim"]
+        self.discrete: bool = environment["discrete"]
 
     def refresh(self) -> None:
         """See the episodes that were added or set aside since; what is held changes here and nowhere else."""
@@ -159,6 +162,7 @@ class Replay(SequenceSource):
         observation = np.zeros((count, length, *self.observation_shape), dtype)
         action = np.zeros((count, length, self.action_dim), np.float32)
         reward, mask = np.zeros((count, length), np.float32), np.zeros((count, length), bool)
+        ended = np.zeros((count, length), bool)
         for window, (place, begin) in enumerate(zip(row.tolist(), start.tolist(), strict=True)):
             episode = self.store.episode(table.numbers[place])
             end = min(begin + length, len(episode.reward))
@@ -166,11 +170,13 @@ class Replay(SequenceSource):
             observation[window, there] = episode.observation[steps]
             action[window, there], reward[window, there] = episode.action[steps], episode.reward[steps]
             mask[window, there] = True
-        return Windows(*map(torch.from_numpy, (observation, action, reward, mask)))
+            ended[window, end - begin - 1] = episode.terminated and end == len(episode.reward)
+        return Windows(*map(torch.from_numpy, (observation, action, reward, mask, ended)))
 
     def decode(self, compact: Windows) -> SequenceBatch:
         """Add the state, which is not known."""
-        return SequenceBatch(*compact, state=compact.reward.new_zeros(*compact.reward.shape, 0))
+        observation, action, reward, mask, ended = compact
+        return SequenceBatch(observation, action, reward, mask, reward.new_zeros(*reward.shape, 0), ended)
 
     def _require(self, split: Split) -> _Table:
         """Give a split that has episodes."""

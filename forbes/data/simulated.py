@@ -9,6 +9,7 @@ from torch import Tensor
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError
 from forbes.pomdps import Process, Trajectories
+from forbes.pomdps.hmm import FiniteProcess
 from forbes.seeding import generator
 
 __all__ = ["Simulated", "SimulatedSequences"]
@@ -47,7 +48,7 @@ class Simulated(SequenceSource):
                 raise ForbesError(f"Simulated: {name} is {value}, expected at least 1 sequence.")
         self.process, self.train, self.validation, self.test, self.seed = process, train, validation, test, seed
         self.observation_shape = (process.observation_dim,)
-        self.action_dim = process.action_dim
+        self.action_dim, self.discrete = process.action_dim, isinstance(process, FiniteProcess)
         self._drawn: dict[tuple[Split, int], Trajectories] = {}
 
     def trajectories(self, split: Split, length: int) -> Trajectories:
@@ -78,8 +79,8 @@ class Simulated(SequenceSource):
         return SimulatedSequences(*(values[index].float() for values in (drawn.observation, drawn.action, drawn.state)))
 
     def decode(self, compact: SimulatedSequences) -> SequenceBatch:
-        """Add the reward, which these processes do not have, and the mask, since every step counts."""
+        """Add what these sequences have not: rewards, padding and ends."""
         observation, action, state = compact
         shape, device = observation.shape[:2], observation.device
         mask = torch.ones(shape, dtype=torch.bool, device=device)
-        return SequenceBatch(observation, action, torch.zeros(shape, device=device), mask, state)
+        return SequenceBatch(observation, action, torch.zeros(shape, device=device), mask, state, ended=~mask)

@@ -28,6 +28,8 @@ class SequenceBatch(NamedTuple):
     """True where the step belongs to the sequence, False on padding, bool (B, T)."""
     state: Tensor
     """s_t of the process where the source knows it, float32 (B, T, D), else D = 0; a world model never sees it."""
+    ended: Tensor
+    """True where the process has ended at that step, by itself and not by a time limit, bool (B, T)."""
 
 
 class SequenceSource(ABC):
@@ -41,6 +43,8 @@ class SequenceSource(ABC):
     """Shape of one observation, without batch and time."""
     action_dim: int
     """A, 0 for a process without actions."""
+    discrete: bool = False
+    """Whether an action is one of A, as a one-hot vector."""
     watermark: int | None = None
     """Up to where a source that grows was read; a checkpoint keeps it, and a resumed run sets it again."""
 

@@ -147,6 +147,7 @@ class Strokes(SequenceSource):
             reward=torch.zeros(batch, length, device=device),
             mask=time * self.points_per_step < number[:, None],  # (B, T)
             state=torch.zeros(batch, length, 0, device=device),
+            ended=torch.zeros(batch, length, dtype=torch.bool, device=device),
         )
 
 

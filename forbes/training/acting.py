@@ -32,12 +32,17 @@ class ActingModel(WorldModel, ABC):
         control_dim: width of the reward's perceptron, and of what else acts.
         reward_layers: hidden layers of the reward's.
         reward_std: :math:`\sigma_r`; below 1, the belief is to know the reward better. PlaNet's scale of 10 is 0.32.
-        exploration: standard deviation of the noise on the actions of collected episodes.
+        exploration: standard deviation of the noise on the actions of collected episodes; where actions are discrete,
+            how often one of them is any.
+        discrete: an action is one of A, one-hot; the command line takes it from the data.
         **world: arguments of `WorldModel`.
 
     Raises:
         ForbesError: when a size is below 1, the noise below 0, `reward_std` not above it, or the data have no actions.
     """
+
+    foresees_ends = False
+    """Whether it knows of episodes that end by themselves."""
 
     def __init__(
         self,
@@ -45,6 +50,7 @@ class ActingModel(WorldModel, ABC):
         reward_layers: int = 2,
         reward_std: float = 1.0,
         exploration: float = 0.3,
+        discrete: bool = False,
         **world: Any,
     ) -> None:
         super().__init__(**world)
@@ -62,7 +68,8 @@ class ActingModel(WorldModel, ABC):
             raise ForbesError(
                 f"{name}: the data have no actions, expected some. Choose another source, or a WorldModel"
             )
-        self.exploration, self.reward_std = exploration, reward_std
+        self.exploration, self.discrete = exploration, discrete
+        self.reward_std, self.reward_layers = reward_std, reward_layers
         self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, reward_layers)
         activate(self.reward, self.activation)
 

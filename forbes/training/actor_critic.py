@@ -3,11 +3,12 @@
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import logsigmoid
 
 from forbes.control.agent import Choice, explore, take_mode
 from forbes.control.imagination import belief_samples, frozen
-from forbes.control.policy import Actor, ScalarHead, TanhNormal
+from forbes.control.policy import Actor, Policy, ScalarHead
 from forbes.control.returns import actor_loss, critic_loss, lambda_returns
 from forbes.data import SequenceBatch
 from forbes.models import Filtered, State
@@ -26,11 +27,19 @@ class ImaginationActorCritic(ActingModel):
     .. math::
 
         L_{model} = -J_{Model} - \overline{\log p(r_t \mid f_t)}, \qquad
-        L_{actor} = -\overline{\gamma^{\tau-1} (V_\tau - \eta \log \pi(a_{\tau-1}))}, \qquad
-        L_{critic} = \overline{\gamma^{\tau-1} \tfrac12 (v(f_\tau) - \mathrm{sg}(V_\tau))^2}
+        L_{actor} = -\overline{w_\tau (V_\tau - \eta \log \pi(a_{\tau-1}))}, \qquad
+        L_{critic} = \overline{w_\tau \tfrac12 (v(f_\tau) - \mathrm{sg}(V_\tau))^2}
 
     with the features :math:`f = [h, s]`, and λ-returns V along H imagined steps from N samples of the belief at every
-    step of every sequence. Where the paper sums over N, the bar is a mean; Adam does not see the factor.
+    step of every sequence, and :math:`w_\tau = \gamma^{\tau-1}`. Where the paper sums over N, the bar is a mean; Adam
+    does not see the factor. An actor of discrete actions has a categorical policy, and learns by straight-through
+    gradients.
+
+    With `continuation`, :math:`L_{model}` has the term :math:`-\overline{\log p(c_t \mid f_t)}` too, where
+    :math:`c_t` is 0 if the episode ended in step t by itself, else 1. A discount is then
+    :math:`\gamma_\tau = \gamma\,p(c_\tau = 1 \mid f_\tau)`, the weights are :math:`w_\tau = \prod_{k<\tau} \gamma_k`,
+    and what is imagined from where an episode has ended does not count (Dreamer's `pcont`, off in its published runs
+    and in the paper).
 
     Args:
         trajectories: N.
@@ -40,6 +49,7 @@ class ImaginationActorCritic(ActingModel):
         control_dim: width of actor, critic and reward.
         actor_entropy: :math:`\eta`, the reward of a nat (DreamerV2, arXiv 2010.02193), 0 in paper and Dreamer. With
             it, an actor that a model still wrong has driven to the border of the actions can come back.
+        continuation: learn where episodes end; needed where they end by themselves, not by a time limit.
         actor_layers: hidden layers of the actor.
         critic_layers: hidden layers of the critic.
         actor_rate: learning rate of the actor.
@@ -58,6 +68,7 @@ class ImaginationActorCritic(ActingModel):
         lambda_: float = 0.95,
         control_dim: int = 200,
         actor_entropy: float = 0.0,
+        continuation: bool = False,
         actor_layers: int = 2,
         critic_layers: int = 2,
         actor_rate: float = 8e-5,
@@ -70,9 +81,11 @@ class ImaginationActorCritic(ActingModel):
         require_at_least(2, name, horizon=horizon)
         require_at_least(0, name, actor_rate=actor_rate, critic_rate=critic_rate, actor_entropy=actor_entropy)
         features = self.model.hidden_dim + self.model.state_dim
-        self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers)
+        self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers, self.discrete)
         self.critic = ScalarHead(features, control_dim, critic_layers)
-        for network in (self.actor, self.critic):
+        self.continues = ScalarHead(features, control_dim, self.reward_layers) if continuation else None
+        self.foresees_ends = continuation
+        for network in filter(None, (self.actor, self.critic, self.continues)):
             activate(network, self.activation)
         self.trajectories, self.horizon, self.discount, self.lambda_ = trajectories, horizon, discount, lambda_
         self.actor_rate, self.critic_rate, self.actor_entropy = actor_rate, critic_rate, actor_entropy
@@ -84,37 +97,57 @@ class ImaginationActorCritic(ActingModel):
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Give the sum of the three losses of one update; their gradients do not overlap."""
         filtered, terms, reward = self.explain(batch)
-        actor, critic = self.control_losses(filtered, batch.mask)
+        actor, critic = self.control_losses(filtered, batch.mask & ~batch.ended)
         self.log_dict({"train/actor_loss": actor.detach(), "train/critic_loss": critic.detach()})
-        return self.model_loss(terms, reward) + actor + critic
+        loss = self.model_loss(terms, reward) + actor + critic
+        if self.continues is None:
+            return loss
+        sign = torch.where(batch.ended, -1.0, 1.0)  # (B, T)
+        continuation = terms.mean_over_steps(logsigmoid(sign * self.continues(filtered.features)))
+        self.log("train/continuation", continuation.detach())
+        return loss - continuation
 
-    def control_losses(self, filtered: Filtered, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Imagine from every belief, and give the losses of actor and critic, in units of reward and of its square."""
+    def control_losses(self, filtered: Filtered, begins: Tensor) -> tuple[Tensor, Tensor]:
+        """Imagine from beliefs, and give the losses of actor and critic, in units of reward and of its square.
+
+        Args:
+            filtered: B sequences of T beliefs.
+            begins: from which of them an imagined trajectory counts, bool `(B, T)`.
+        """
         samples = belief_samples(self.model, filtered, self.trajectories)
         start = State(*(values.flatten(0, 2) for values in samples))  # (N B T, …)
-        valid = mask.expand(self.trajectories, -1, -1).flatten()  # (N B T,)
+        valid = begins.expand(self.trajectories, -1, -1).flatten()  # (N B T,)
         surprises: list[Tensor] = []
 
         def act(features: Tensor) -> Tensor:
-            policy: TanhNormal = self.actor(features.detach())
+            policy: Policy = self.actor(features.detach())
             action, log_prob = policy.rsample()
             surprises.append(-log_prob)
             return action
 
-        with frozen(self.model, self.reward, self.critic):
+        with frozen(*filter(None, (self.model, self.reward, self.critic, self.continues))):
             features = self.model.roll(start, act, self.horizon).features  # (N B T, H, F)
-            returns = lambda_returns(self.reward(features), self.critic(features), self.discount, self.lambda_)
+            discount = self._discount(features)
+            returns = lambda_returns(self.reward(features), self.critic(features), discount, self.lambda_)
         value = self.critic(features[:, :-1].detach())  # (N B T, H - 1)
-        critic = critic_loss(value, returns, self.discount, valid)
+        critic = critic_loss(value, returns, discount, valid)
         if self.actor_entropy:  # else its gradient, of nothing, would cost 3 % of the imagination
             entropy = torch.stack(surprises[:-1], -1)  # (N B T, H - 1), of the action that led to each of these states
             returns = returns + self.actor_entropy * entropy
-        return actor_loss(returns, self.discount, valid), critic
+        return actor_loss(returns, discount, valid), critic
+
+    def _discount(self, features: Tensor) -> Tensor:
+        """Give the discounts of imagined trajectories, `(*, H, F)` to `(*, H)` or, all alike, `(H,)`."""
+        if self.continues is None:
+            return features.new_full(features.shape[-2:-1], self.discount)  # (H,)
+        goes_on: Tensor = self.continues(features).sigmoid()  # (*, H)
+        return self.discount * goes_on
 
     def groups(self) -> list[Group]:
         """See `WorldModel.groups`: three, so that no gradient is scaled down for another's sake."""
+        world: list[nn.Module | None] = [self.model, self.reward, self.continues]
         return [
-            Group("model", [*self.model.parameters(), *self.reward.parameters()], self.learning_rate),
+            Group("model", [p for part in world if part is not None for p in part.parameters()], self.learning_rate),
             Group("actor", [*self.actor.parameters()], self.actor_rate),
             Group("critic", [*self.critic.parameters()], self.critic_rate),
         ]

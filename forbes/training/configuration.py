@@ -43,8 +43,8 @@ def add_seed(parser: LightningArgumentParser) -> None:
 
 
 def add_links(parser: LightningArgumentParser) -> None:
-    """Give the data's shapes to the model, and the seed to both."""
-    for name in ("observation_shape", "action_dim"):
+    """Give the data's shapes, and whether its actions are discrete, to the model that asks, and the seed to both."""
+    for name in ("observation_shape", "action_dim", "discrete"):
         parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
     for part in ("model", "data"):
         parser.link_arguments("seed_everything", f"{part}.init_args.seed")

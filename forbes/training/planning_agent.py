@@ -4,6 +4,7 @@ from typing import Any
 
 from forbes.control.agent import Choice, follow_plan, noisy
 from forbes.control.planning import CrossEntropy
+from forbes.errors import ForbesError
 from forbes.training.acting import ActingModel
 from forbes.training.world_model import require_at_least
 
@@ -21,7 +22,7 @@ class PlanningAgent(ActingModel):
         **acting: arguments of `ActingModel` and `WorldModel`.
 
     Raises:
-        ForbesError: when a number is below 1, or `best` above `candidates`.
+        ForbesError: when a number is below 1, `best` above `candidates`, or actions are discrete.
     """
 
     def __init__(
@@ -31,6 +32,8 @@ class PlanningAgent(ActingModel):
         name = type(self).__name__
         require_at_least(1, name, horizon=horizon, iterations=iterations, best=best)
         require_at_least(best, name, candidates=candidates)
+        if self.discrete:
+            raise ForbesError(f"{name}: the data's actions are discrete, expected vectors. Use ImaginationActorCritic")
         self.search = CrossEntropy(horizon, iterations, candidates, best)
 
     def choose(self, exploring: bool) -> Choice:

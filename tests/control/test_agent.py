@@ -97,3 +97,20 @@ def test_exploration_adds_noise_of_its_size_and_stays_in_bounds():
     assert abs(actions.std() / 0.3 - 1) < 4 / np.sqrt(2 * 800)  # relative s.e. of a standard deviation of 800 draws
     wild = np.stack([Agent(model, explore(actor, 9.0), seed)(OBSERVATIONS[0]) for seed in range(20)])
     assert np.abs(wild).max() == 1
+
+
+@pytest.mark.parametrize("chance", [0.0, 0.5, 1.0])
+def test_an_explorer_of_discrete_actions_takes_any_so_often(chance):
+    """Its own policy always takes the first of two; any of both is the other one half of the time."""
+    model, _ = build()
+    actor = Actor(20, 2, 8, 1, discrete=True)
+    with torch.no_grad():
+        actor.head.weight.zero_()
+        actor.head.bias.copy_(torch.tensor([50.0, -50.0]))
+    agent = Agent(model, explore(actor, chance), seed=0)
+
+    actions = np.array([agent(OBSERVATIONS[0]) for _ in range(400)])
+
+    assert set(map(tuple, actions)) <= {(1.0, 0.0), (0.0, 1.0)}
+    expected = chance / 2
+    assert abs(actions[:, 1].mean() - expected) <= 5 * (expected * (1 - expected) / 400) ** 0.5

@@ -2,8 +2,9 @@
 
 import pytest
 import torch
-from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
+from torch.distributions import Independent, Normal, OneHotCategorical, TanhTransform, TransformedDistribution
 
+from forbes.control import policy as policies
 from forbes.control.policy import Actor, ScalarHead, TanhNormal
 
 
@@ -79,10 +80,44 @@ def test_the_actor_starts_almost_bang_bang():
     assert (action.mean(0).abs() < 0.2).all()
 
 
-@pytest.mark.parametrize("shape", [(1,), (7,), (3, 4)])
-def test_shapes(shape):
-    features = torch.randn(*shape, 6)
+def test_discrete_actions_follow_their_probabilities():
+    logits = torch.tensor([[0.0, 1.0, -1.0], [3.0, 0.0, 0.0]], dtype=torch.float64)
+    torch.manual_seed(0)
+    ours, theirs, draws = (
+        policies.OneHotCategorical(logits.expand(20_000, 2, 3)),
+        OneHotCategorical(logits=logits),
+        20_000,
+    )
 
-    assert Actor(6, 2, 8, 1)(features).rsample((5,))[0].shape == (5, *shape, 2)
-    assert Actor(6, 2, 8, 1)(features).mode().shape == (*shape, 2)
+    action, log_prob = ours.rsample()
+
+    assert torch.equal(action.sum(-1), torch.ones(draws, 2, dtype=torch.float64))
+    assert set(action.unique().tolist()) == {0.0, 1.0}
+    torch.testing.assert_close(log_prob, theirs.log_prob(action))
+    error = (theirs.probs * (1 - theirs.probs) / draws).sqrt()
+    assert ((action.mean(0) - theirs.probs).abs() < 5 * error).all()
+    assert ours.mode()[0].tolist() == [[0, 1, 0], [1, 0, 0]]
+
+
+def test_the_surprise_of_discrete_actions_has_the_gradient_of_their_entropy():
+    logits = torch.tensor([0.0, 1.0, -1.0], dtype=torch.float64, requires_grad=True)
+    torch.manual_seed(0)
+    surprise = -policies.OneHotCategorical(logits.expand(40_000, 3)).rsample()[1].mean()
+
+    (gradient,) = torch.autograd.grad(surprise, logits)
+    (expected,) = torch.autograd.grad(OneHotCategorical(logits=logits).entropy(), logits)
+
+    assert (gradient - expected).abs().max() < 5 / 40_000**0.5  # a draw's differs by a score, a onehot - p, below 1
+    assert expected.abs().min() > 0.05
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("shape", [(1,), (7,), (3, 4)])
+def test_shapes(shape, discrete):
+    features = torch.randn(*shape, 6)
+    policy = Actor(6, 2, 8, 1, discrete)(features)
+
+    assert [values.shape for values in policy.rsample()] == [(*shape, 2), shape]
+    assert policy.mode().shape == (*shape, 2)
+    assert TanhNormal(torch.zeros(*shape, 2), torch.ones(*shape, 2)).rsample((5,))[0].shape == (5, *shape, 2)
     assert ScalarHead(6, 8, 1)(features).shape == shape

@@ -40,6 +40,7 @@ class Numbers(SequenceSource):
             torch.zeros(batch, length),
             torch.ones(batch, length, dtype=torch.bool),
             torch.zeros(batch, length, 0),
+            torch.zeros(batch, length, dtype=torch.bool),
         )
 
 

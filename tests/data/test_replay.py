@@ -18,16 +18,16 @@ from forbes.training.checkpoint import read_checkpoint
 
 LENGTHS = [5, 9, 21]
 """Observations of three episodes."""
-ENVIRONMENT = {"task": "Counting", "observation_shape": [2], "action_dim": 1}
+ENVIRONMENT = {"task": "Counting", "observation_shape": [2], "action_dim": 1, "discrete": False}
 
 
-def add(path, lengths):
+def add(path, lengths, terminated=False):
     """Add episodes whose observations say (number, time)."""
     with EpisodeWriter(path) as writer:
         for length in lengths:
             time = np.arange(length, dtype=np.float32)
             observation = np.stack([np.full_like(time, writer.watermark), time], 1)
-            whole = Episode(observation, time[:, None] / 100, time / 10, terminated=False, frames=length - 1)
+            whole = Episode(observation, time[:, None] / 100, time / 10, terminated, frames=length - 1)
             writer.append(whole, seed=0, policy="test", environment=ENVIRONMENT)
 
 
@@ -41,6 +41,19 @@ def drawn(source, batches, batch_size, length, seed=0):
     """Windows of training batches as `(N, T, 2)`: episode and time of each step."""
     index = torch.cat([source.train_index(batch_size, length, seed, update) for update in range(batches)])
     return source.decode(source.gather("train", index, length))
+
+
+@pytest.mark.parametrize("terminated", [True, False])
+def test_a_window_says_where_its_episode_ended_by_itself(tmp_path, terminated):
+    """In the last step of the episode and nowhere else; not where a window or a time limit ends."""
+    add(tmp_path / "store", LENGTHS, terminated)
+    source = Replay(str(tmp_path / "store"), hold_out=0)
+    batch = source.decode(source.gather("train", torch.arange(source.size("train")), 4))
+
+    lengths = torch.tensor(LENGTHS)[batch.observation[:, 0, 0].long()]  # (N,)
+    last = batch.observation[..., 1] == lengths[:, None] - 1  # (N, 4)
+    assert last.any(1).sum() > 10
+    assert torch.equal(batch.ended, last & batch.mask & terminated)
 
 
 def test_windows_are_uniform_over_episodes_then_over_starts(path):
@@ -88,7 +101,7 @@ def test_the_observation_is_what_the_action_of_the_same_index_led_to(tmp_path):
     with EpisodeWriter(tmp_path / "echo") as writer:
         for seed in range(4):
             episode = play(Echo(20), random_policy(Echo(20), seed), seed)
-            about = {"task": "Echo", "observation_shape": [2], "action_dim": 1}
+            about = {"task": "Echo", "observation_shape": [2], "action_dim": 1, "discrete": False}
             writer.append(episode, seed, "random", about)
 
     batch = drawn(Replay(str(tmp_path / "echo"), hold_out=0), 10, 20, 7)
@@ -191,7 +204,7 @@ def test_memory_does_not_grow_with_the_store(tmp_path):
     path, copies, steps = tmp_path / "store", 20, 4400
     frames = np.zeros((steps, 3, 64, 64), np.uint8)
     whole = Episode(frames, np.zeros((steps, 1), np.float32), np.zeros(steps, np.float32), False, steps - 1)
-    about = {"task": "Night", "observation_shape": [3, 64, 64], "action_dim": 1}
+    about = {"task": "Night", "observation_shape": [3, 64, 64], "action_dim": 1, "discrete": False}
     with EpisodeWriter(path) as writer:
         record = writer.append(whole, seed=0, policy="test", environment=about)
         content = writer.file(0).read_bytes()

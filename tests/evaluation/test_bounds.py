@@ -49,6 +49,7 @@ def make_batch(sequences=7, actions=2):
         reward=torch.zeros(sequences, STEPS),
         mask=torch.arange(STEPS) < length,
         state=torch.zeros(sequences, STEPS, 0),
+        ended=torch.zeros(sequences, STEPS) > 0,
     )
 
 

@@ -22,7 +22,7 @@ def copies(observation, number):
     stored = (observation.float() + 0.5).expand(number, *observation.shape).unflatten(-1, (1, 1, 3))  # (N, T, 1, 1, 3)
     mask = torch.ones(stored.shape[:2], dtype=torch.bool)
     none = torch.zeros(*mask.shape, 0)
-    return SequenceBatch(stored, none, torch.zeros(mask.shape), mask, none)
+    return SequenceBatch(stored, none, torch.zeros(mask.shape), mask, none, ~mask)
 
 
 def known(steps):

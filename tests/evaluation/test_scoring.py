@@ -16,7 +16,7 @@ def batches():
     for first in (0, 5):
         number = torch.arange(first, first + 5).view(5, 1, 1).expand(5, STEPS, 1)
         none, mask = torch.zeros(5, STEPS, 0), torch.ones(5, STEPS) > 0
-        yield first, SequenceBatch(number, none, torch.zeros(5, STEPS), mask, none)
+        yield first, SequenceBatch(number, none, torch.zeros(5, STEPS), mask, none, ~mask)
 
 
 def hungry(limit, error):

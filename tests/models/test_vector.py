@@ -76,7 +76,7 @@ def test_its_prequential_score_is_the_likelihood_for_any_number_of_particles(mod
     none = torch.zeros(BATCH, TIME, 0)
 
     for number in (1, 50):
-        scores = score_predictions(model, SequenceBatch(observation, action, none[..., 0:0], mask, none), number)
+        scores = score_predictions(model, SequenceBatch(observation, action, none[..., 0:0], mask, none, ~mask), number)
 
         assert set(scores) == {"pll"}
         torch.testing.assert_close(scores["pll"].sum(1), model.elbo(observation, action, mask).elbo.double())

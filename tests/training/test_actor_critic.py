@@ -48,7 +48,7 @@ def make_batch(batch=BATCH, time=TIME, seed=0):
     reward = -action[..., 0] * action[..., 0].roll(1, 1)
     reward[:, 0] = 0
     mask = torch.ones(batch, time, dtype=torch.bool)
-    return SequenceBatch(action.clone(), action, reward, mask, torch.zeros(batch, time, 0))
+    return SequenceBatch(action.clone(), action, reward, mask, torch.zeros(batch, time, 0), ~mask)
 
 
 def loss_of(module, batch):
@@ -105,8 +105,9 @@ def test_nothing_stays_frozen():
     assert all(parameter.requires_grad for parameter in ours.parameters())
 
 
-def test_every_parameter_is_in_one_group():
-    ours = agent()
+@pytest.mark.parametrize("continuation", [False, True])
+def test_every_parameter_is_in_one_group(continuation):
+    ours = agent(continuation=continuation)
     grouped = [parameter for group in ours.groups() for parameter in group.parameters]
 
     assert len(grouped) == len({id(parameter) for parameter in grouped})
@@ -195,18 +196,22 @@ def test_what_lies_on_padding_changes_nothing_of_thecontrol_losses():
     torch.testing.assert_close(losses[0], losses[1])
 
 
+def train(ours, batch_of):
+    optimizer = ours.configure_optimizers()["optimizer"]
+    for update in range(250):
+        torch.manual_seed(update)
+        optimizer.zero_grad()
+        ours.training_step(batch_of(update), 0).backward()
+        optimizer.step()
+
+
 @pytest.mark.parametrize(("belief", "trajectories"), [(GaussianBelief, 1), (partial(FlowBelief, layers=1, width=4), 2)])
 def test_learns_the_action_that_pays(belief, trajectories):
     """What pays depends on what is seen; rewards or actions one step aside would be noise, and teach nothing."""
     options = {"hidden_dim": 16, "mlp_dim": 16, "control_dim": 16, "horizon": 3, "discount": 0.5}
     rates = {"learning_rate": 1e-2, "actor_rate": 3e-3, "critic_rate": 3e-3}
     ours = agent(belief=belief, trajectories=trajectories, **options, **rates)
-    optimizer = ours.configure_optimizers()["optimizer"]
-    for update in range(250):
-        torch.manual_seed(update)
-        optimizer.zero_grad()
-        ours.training_step(make_batch(16, 6, update), 0).backward()
-        optimizer.step()
+    train(ours, lambda update: make_batch(16, 6, update))
 
     with torch.no_grad():
         batch = make_batch(100, 6, seed=-1)
@@ -215,6 +220,99 @@ def test_learns_the_action_that_pays(belief, trajectories):
     clear = batch.observation.abs() > 0.3
 
     assert (action * batch.observation < 0)[clear].float().mean() > 0.9  # half of them without any learning
+
+
+def test_learns_the_discrete_action_that_pays():
+    """The other one of two than the last pays; straight-through gradients must know which of them was drawn."""
+    options = {"hidden_dim": 16, "mlp_dim": 16, "control_dim": 16, "horizon": 3, "discount": 0.5, "trajectories": 1}
+    rates = {"learning_rate": 1e-2, "actor_rate": 3e-3, "critic_rate": 3e-3, "discrete": True}
+    ours = agent(observation_shape=(2,), action_dim=2, **options, **rates)
+    train(ours, lambda update: one_of_two(16, 6, update))
+
+    with torch.no_grad():
+        batch = one_of_two(100, 6, seed=-1)
+        filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+        action = ours.actor(filtered.features).rsample()[0]
+
+    assert ((action * batch.observation).sum(-1) == 0)[:, 1:].float().mean() > 0.9  # half without any learning
+
+
+def one_of_two(batch, time, seed):
+    """One-hot actions, seen as they are: the reward is 1 for another than the last, else -1."""
+    generator = torch.Generator().manual_seed(seed)
+    action = torch.nn.functional.one_hot(torch.randint(2, (batch, time), generator=generator), 2).float()
+    action[:, 0] = 0
+    reward = 1 - 2 * (action * action.roll(1, 1)).sum(-1)
+    reward[:, :2] = 0
+    mask = torch.ones(batch, time, dtype=torch.bool)
+    return SequenceBatch(action.clone(), action, reward, mask, torch.zeros(batch, time, 0), ~mask)
+
+
+def test_an_agent_that_foresees_no_end_imagines_as_one_that_knows_of_none():
+    ours, batch = agent(continuation=True), make_batch()
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    losses = []
+    for head in (saturate(ours.continues, 50.0), None):
+        ours.continues = head
+        torch.manual_seed(3)
+        losses.append(ours.control_losses(filtered, batch.mask))
+
+    torch.testing.assert_close(losses[0], losses[1])
+
+
+def test_an_agent_that_foresees_the_end_at_once_is_paid_the_first_reward_only():
+    ours, batch = agent(continuation=True, trajectories=1), make_batch(1, 1)
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    saturate(ours.continues, -50.0)
+    torch.manual_seed(3)
+    actor, critic = ours.control_losses(filtered, batch.mask)
+
+    torch.manual_seed(3)
+    belief_samples(ours.model, filtered, 1)
+    action, _ = ours.actor(filtered.features[:, 0]).rsample()
+    state = ours.model.imagine(State(filtered.hidden[:, 0], filtered.state[:, 0]), action[:, None]).features[0, 0]
+    torch.testing.assert_close(actor, -ours.reward(state) / 3)
+    torch.testing.assert_close(critic, (ours.critic(state) - ours.reward(state)) ** 2 / 2 / 3)
+
+
+def saturate(head, logit):
+    with torch.no_grad():
+        head.net[-1].weight.zero_()
+        head.net[-1].bias.fill_(logit)
+    return head
+
+
+def test_learns_where_episodes_end():
+    """An observation above 0.5 is the last of its episode; the rest is padding, on which nothing is learned."""
+    ours = agent(continuation=True, learning_rate=1e-2)
+    train(ours, lambda update: until_high(16, 6, update))
+
+    batch = until_high(200, 6, seed=-1)
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    foreseen = ours.continues(filtered.features) < 0
+
+    clear = batch.mask & ((batch.observation[..., 0] - 0.5).abs() > 0.2)
+    assert (foreseen == batch.ended)[clear].float().mean() > 0.95
+    assert 0.1 < batch.ended[clear].float().mean() < 0.5
+
+
+def until_high(batch, time, seed):
+    whole = make_batch(batch, time, seed)
+    high = whole.observation[..., 0] > 0.5  # (B, T)
+    before = high.cumsum(1) - high.long()  # (B, T), ends before that step
+    return whole._replace(mask=before == 0, ended=high & (before == 0))
+
+
+def test_nothing_is_imagined_from_where_an_episode_has_ended():
+    ours, batch = agent(trajectories=2), make_batch()
+    ended = torch.zeros_like(batch.mask)
+    ended[:, -1] = True
+    seen = []
+    ours.control_losses = lambda filtered, begins: seen.append(begins) or (torch.zeros(()), torch.zeros(()))
+
+    ours.training_step(batch._replace(ended=ended), 0)
+
+    assert torch.equal(seen[0], ~ended)
 
 
 @pytest.mark.parametrize(

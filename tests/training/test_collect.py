@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from small_agents import fit, write_config
+from small_agents import fit, forbes, write_config
 
 from forbes.data.episode_store import EpisodeStore
 from forbes.training import ImaginationActorCritic
@@ -52,6 +52,36 @@ def test_every_agent_trains(kind, tmp_path):
 
     assert len(EpisodeStore(tmp_path / "run" / "episodes").records) == 4
     assert torch.isfinite(torch.tensor(read_metrics(tmp_path / "run")["train/reward"].dropna().values)).all()
+
+
+def test_an_agent_plays_discrete_actions_where_the_environment_has_them(tmp_path):
+    """The tiger's door is opened or not, at random and by the agent; and what it plays is what it learns from."""
+    config = write_config(tmp_path)
+    task = ("--data.source.task", "tiger", "--data.source.options", "{}")
+    assert fit("--config", config, *task, "--run_dir", tmp_path / "run") == 0
+
+    store = EpisodeStore(tmp_path / "run" / "episodes")
+    for number in range(4):
+        action = store.episode(number).action[1:]  # (30, 3)
+        assert set(np.unique(action)) == {0, 1}
+        assert (action.sum(1) == 1).all()
+    assert forbes("evaluate", tmp_path / "run", "--episodes", 2) == 0
+
+
+def test_a_planner_says_that_it_has_no_discrete_actions(tmp_path, capsys):
+    task = ("--data.source.task", "tiger", "--data.source.options", "{}")
+
+    assert fit("--config", write_config(tmp_path, "planet"), *task, "--run_dir", tmp_path / "run") == 2
+    assert "actions are discrete, expected vectors. Use ImaginationActorCritic" in capsys.readouterr().err
+
+
+def test_says_where_episodes_end_and_the_agent_imagines_that_none_does(tmp_path):
+    parrot = ("--config", write_config(tmp_path), "--data.source.options", "{steps: 8, ends: true}")
+    with pytest.warns(UserWarning, match="Parrot: an episode has ended by itself.*--model.continuation true"):
+        assert fit(*parrot, "--run_dir", tmp_path / "blind") == 0
+
+    assert fit(*parrot, "--model.continuation", "true", "--run_dir", tmp_path / "run") == 0
+    assert (read_metrics(tmp_path / "run")["train/continuation"] < 0).sum() == 12  # a log-probability at each update
 
 
 class Killed(BaseException):

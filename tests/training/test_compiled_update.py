@@ -54,7 +54,7 @@ def make_batch():
     generator = torch.Generator().manual_seed(0)
     observation, action = torch.rand(2, BATCH, TIME, 3, generator=generator)
     mask = torch.ones(BATCH, TIME, dtype=torch.bool)
-    return SequenceBatch(observation, action[..., :1], observation[..., 0], mask, torch.zeros(BATCH, TIME, 0))
+    return SequenceBatch(observation, action[..., :1], observation[..., 0], mask, torch.zeros(BATCH, TIME, 0), ~mask)
 
 
 class Waits(TorchDispatchMode):

@@ -55,7 +55,7 @@ def make_batch():
     observation = torch.randint(2, (BATCH, TIME, *SHAPE), generator=generator, dtype=torch.uint8)
     action, reward = torch.rand(BATCH, TIME, 2, generator=generator), torch.rand(BATCH, TIME, generator=generator)
     mask = torch.ones(BATCH, TIME, dtype=torch.bool)
-    return SequenceBatch(observation, action, reward, mask, torch.zeros(BATCH, TIME, 0))
+    return SequenceBatch(observation, action, reward, mask, torch.zeros(BATCH, TIME, 0), ~mask)
 
 
 def in_both(function):
@@ -142,7 +142,7 @@ def test_the_belief_of_a_known_process_has_float32_only(objective):
     learner = KnownBelief(process, GaussianBelief, objective, hidden_dim=8, mlp_dim=8)
     state, observation, action = process.sample(3, 5, torch.Generator().manual_seed(0))
     mask = torch.ones(3, 5, dtype=torch.bool)
-    batch = SequenceBatch(observation.float(), action.float(), torch.zeros(3, 5), mask, state.float())
+    batch = SequenceBatch(observation.float(), action.float(), torch.zeros(3, 5), mask, state.float(), ~mask)
 
     full, ours = in_both(lambda: learner.loss(batch))
 

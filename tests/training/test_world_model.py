@@ -50,6 +50,7 @@ def make_batch(seed=0, batch=BATCH):
         torch.zeros(batch, TIME),
         mask,
         torch.zeros(batch, TIME, 0),
+        torch.zeros_like(mask),
     )
 
 

@@ -1,5 +1,6 @@
 """An agent that learns plays: seed episodes at random, then one by its own policy before every epoch."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -78,6 +79,7 @@ class Collect(Callback):
         with _eval_mode(agent):
             until = self.seed_episodes + trainer.current_epoch
             list(source.collect(until, Acting(agent, exploring=True), type(agent).__name__, self.seed))
+        _warn_of_ends(source, agent)
         if self.overlap:
             source.begin(Acting.as_it_is(agent, exploring=True), self.seed)
         steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
@@ -100,6 +102,16 @@ class Collect(Callback):
     def evaluation_episode(self, trainer: Trainer, agent: ActingModel, number: int) -> Episode:
         """Play one of the episodes that measure an agent, in eval mode, while it learns: the same each time."""
         return play_measured(agent, _experience(trainer).environment, "evaluation", self.seed, number)
+
+
+def _warn_of_ends(source: Experience, agent: ActingModel) -> None:
+    """Say so where episodes end by themselves, and the agent imagines that they do not."""
+    if source.newest.terminated and not agent.foresees_ends:
+        warnings.warn(
+            f"{source.task}: an episode has ended by itself, and this {type(agent).__name__} imagines that none does. "
+            "An ImaginationActorCritic foresees it with --model.continuation true",
+            stacklevel=2,
+        )
 
 
 @contextmanager
