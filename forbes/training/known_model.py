@@ -19,6 +19,7 @@ from forbes.pomdps.base import require_positive
 from forbes.pomdps.distributions import PointMass
 from forbes.precision import full_precision
 from forbes.seeding import derive_seed, generator
+from forbes.training.world_model import follow_rates
 
 __all__ = ["KnownBelief", "Objective", "has_transition_density"]
 
@@ -142,6 +143,10 @@ class KnownBelief(LightningModule):
         optimizer = Adam(self.parameters(), lr=self.learning_rate, fused=True)
         scheduler = LambdaLR(optimizer, self._rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_train_start(self) -> None:
+        """See `WorldModel.on_train_start`."""
+        follow_rates(self, [self.learning_rate])
 
     def _rate(self, update: int) -> float:
         """Give the learning rate of an update as a share of `learning_rate`."""

@@ -1,7 +1,8 @@
 """The world model as a LightningModule: it optimises and logs; the mathematics is in `forbes.models`."""
 
 import math
-from typing import Any, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from lightning import LightningModule
@@ -19,7 +20,7 @@ from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, Decoder
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
 
-__all__ = ["Group", "WorldModel", "require_at_least"]
+__all__ = ["Group", "WorldModel", "follow_rates", "require_at_least"]
 
 
 class Group(NamedTuple):
@@ -169,6 +170,10 @@ class WorldModel(LightningModule):
         scheduler = LambdaLR(optimizer, self._rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
+    def on_train_start(self) -> None:
+        """Learn at the rates of the configuration, which a resumed run may have changed."""
+        follow_rates(self, [group.rate for group in self.groups()])
+
     def _rate(self, update: int) -> float:
         """Give the learning rate of an update as a share of `learning_rate`."""
         rise = min(1.0, (update + 1) / self.warmup) if self.warmup else 1.0
@@ -194,6 +199,14 @@ class WorldModel(LightningModule):
         }
         values = {self.objective_name: terms.elbo.mean()} | {name: parts[name] for name in self.model.parts}
         self.log_dict({f"{split}/{name}": value.detach() for name, value in values.items()}, batch_size=len(terms.mask))
+
+
+def follow_rates(module: LightningModule, rates: Sequence[float]) -> None:
+    """Set the learning rates of a module's one `LambdaLR`, a rate each group: a checkpoint brings back its own."""
+    scheduler = cast(LambdaLR, module.lr_schedulers())
+    scheduler.base_lrs = [*rates]
+    for group, rate, share in zip(scheduler.optimizer.param_groups, rates, scheduler.lr_lambdas, strict=True):
+        group["lr"] = rate * share(scheduler.last_epoch)
 
 
 def _require_mean(likelihood: Likelihood) -> None:

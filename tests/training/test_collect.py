@@ -113,6 +113,17 @@ def test_a_killed_run_goes_on_to_the_same_numbers_and_the_same_episodes(run, tmp
     assert any((other / "episodes" / "set_aside").iterdir())
 
 
+def test_a_resumed_run_learns_at_the_rates_it_is_given(run, tmp_path):
+    """At rates of 0 it stays what it was."""
+    other = shutil.copytree(run, tmp_path / "run")
+    rates = [f"--model.{name}=0" for name in ("learning_rate", "actor_rate", "critic_rate")]
+    assert fit("--resume", other, *rates, "--trainer.max_epochs", 5) == 0
+
+    state, expected = (read_checkpoint(RunFolder(path).checkpoint)["state_dict"] for path in (other, run))
+    torch.testing.assert_close(state, expected, rtol=0, atol=0)
+    assert len(read_metrics(other)) == 20
+
+
 def test_overlapped_episodes_are_one_epoch_older_and_resume_to_the_same_numbers(run, tmp_path, monkeypatch):
     """The first epoch's agent plays the third episode, as without; from then on it is always one epoch behind."""
 
