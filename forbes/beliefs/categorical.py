@@ -2,13 +2,12 @@
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import one_hot
 
 from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.deferred import Loop
 from forbes.errors import ForbesError
 
-__all__ = ["CategoricalBelief", "draw_one_hot"]
+__all__ = ["CategoricalBelief", "draw_one_hot", "one_hot_of"]
 
 
 class CategoricalBelief(BeliefHead):
@@ -76,6 +75,11 @@ class CategoricalBelief(BeliefHead):
         return variables.log_softmax(-1)
 
 
+def one_hot_of(index: Tensor, like: Tensor) -> Tensor:
+    """Give rows of 0 with a 1 at the index, `(*, 1)`, in the shape and dtype of `like`; `one_hot` reads the values."""
+    return torch.zeros_like(like).scatter(-1, index, 1.0)
+
+
 def _scale_gradient(x: Tensor, share: float) -> Tensor:
     """Give x, with so much of its gradient."""
     return torch.lerp(x.detach(), x, share)
@@ -94,7 +98,7 @@ def draw_one_hot(log_probability: Tensor, sample_shape: tuple[int, ...] = ()) ->
     # The largest of log π - log E, E exponential, is at k with probability π_k: no call that waits for the device.
     shape = (*sample_shape, *log_probability.shape)  # (*sample_shape, *, G, K)
     race = log_probability.new_empty(shape).exponential_().log()
-    drawn = one_hot((log_probability.detach() - race).argmax(-1), log_probability.shape[-1])  # (*, G, K)
+    drawn = one_hot_of((log_probability.detach() - race).argmax(-1, keepdim=True), race)  # (*sample_shape, *, G, K)
     probability = log_probability.exp()
     state = (drawn + (probability - probability.detach())).flatten(-2)  # (*, D)
     return state, (state * log_probability.flatten(-2)).sum(-1)

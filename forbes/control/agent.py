@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import one_hot
 
+from forbes.beliefs.categorical import one_hot_of
 from forbes.control.planning import CrossEntropy, plan
 from forbes.control.policy import Actor, Policy
 from forbes.models import Filtered, State, StateSpaceModel
@@ -90,9 +90,8 @@ def _sometimes_any(choose: Choice, chance: float) -> Choice:
 
     def choose_or_draw(filtered: Filtered) -> Tensor:
         action = choose(filtered)  # (1, A)
-        actions = action.shape[-1]
-        drawn = one_hot(torch.randint(actions, (len(action),), device=action.device), actions)  # (1, A)
-        return torch.where(torch.rand(len(action), 1, device=action.device) < chance, drawn.to(action), action)
+        drawn = one_hot_of(torch.randint(action.shape[-1], (1, 1), device=action.device), action)
+        return torch.where(torch.rand(1, 1, device=action.device) < chance, drawn, action)
 
     return choose_or_draw
 

@@ -5,9 +5,9 @@ from typing import Protocol
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import one_hot, softplus
+from torch.nn.functional import softplus
 
-from forbes.beliefs.categorical import draw_one_hot
+from forbes.beliefs.categorical import draw_one_hot, one_hot_of
 from forbes.models.networks import Perceptron
 
 __all__ = ["Actor", "OneHotCategorical", "Policy", "ScalarHead", "TanhNormal"]
@@ -76,8 +76,7 @@ class OneHotCategorical:
 
     def mode(self) -> Tensor:
         """See `Policy.mode`."""
-        best = one_hot(self.log_probability.argmax(-1), self.log_probability.shape[-1])  # (*, A)
-        return best.to(self.log_probability.dtype)
+        return one_hot_of(self.log_probability.argmax(-1, keepdim=True), self.log_probability)
 
 
 class Actor(nn.Module):

@@ -29,7 +29,13 @@ def fresh_compiler():
 
 
 @pytest.fixture(
-    params=[GaussianBelief, partial(FlowBelief, layers=2, width=4)], ids=["dreamer", "forbes"], name="agent"
+    params=[
+        {"belief": GaussianBelief},
+        {"belief": partial(FlowBelief, layers=2, width=4)},
+        {"belief": GaussianBelief, "discrete": True, "continuation": True, "actor_entropy": 0.1},
+    ],
+    ids=["dreamer", "forbes", "discrete"],
+    name="agent",
 )
 def agent_fixture(request):
     torch.manual_seed(0)
@@ -37,16 +43,16 @@ def agent_fixture(request):
         trajectories=2,
         horizon=2,
         control_dim=8,
-        belief=request.param,
         encoder=partial(MLPEncoder, width=8, layers=1),
         decoder=partial(MLPDecoder, width=8, layers=1),
         likelihood=VectorNormal(),
         observation_shape=(3,),
-        action_dim=1,
+        action_dim=2,
         state_dim=2,
         hidden_dim=6,
         mlp_dim=8,
         mlp_layers=1,
+        **request.param,
     )
 
 
@@ -54,7 +60,7 @@ def make_batch():
     generator = torch.Generator().manual_seed(0)
     observation, action = torch.rand(2, BATCH, TIME, 3, generator=generator)
     mask = torch.ones(BATCH, TIME, dtype=torch.bool)
-    return SequenceBatch(observation, action[..., :1], observation[..., 0], mask, torch.zeros(BATCH, TIME, 0), ~mask)
+    return SequenceBatch(observation, action[..., :2], observation[..., 0], mask, torch.zeros(BATCH, TIME, 0), ~mask)
 
 
 class Waits(TorchDispatchMode):
