@@ -102,7 +102,7 @@ def test_equals_a_plain_loop_over_sequences_and_steps(likelihood, batch_size, mo
     with torch.no_grad():
         expected = [
             plain_elbo(model, observation, action, int(mask.sum()))
-            for observation, action, _, mask, _ in zip(*batch, strict=True)
+            for observation, action, mask in zip(batch.observation, batch.action, batch.mask, strict=True)
         ]
     torch.testing.assert_close(scores["elbo"], torch.tensor(expected, dtype=torch.float64))
     torch.testing.assert_close(scores["reconstruction"] - scores["kl"], scores["elbo"])
