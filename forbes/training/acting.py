@@ -41,9 +41,6 @@ class ActingModel(WorldModel, ABC):
         ForbesError: when a size is below 1, the noise below 0, `reward_std` not above it, or the data have no actions.
     """
 
-    foresees_ends = False
-    """Whether it knows of episodes that end by themselves."""
-
     def __init__(
         self,
         control_dim: int = 200,
@@ -72,6 +69,11 @@ class ActingModel(WorldModel, ABC):
         self.reward_std, self.reward_layers = reward_std, reward_layers
         self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, reward_layers)
         activate(self.reward, self.activation)
+
+    @property
+    def foresees_ends(self) -> bool:
+        """Whether it learns where episodes end by themselves."""
+        return False
 
     @abstractmethod
     def choose(self, exploring: bool) -> Choice:

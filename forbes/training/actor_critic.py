@@ -84,11 +84,15 @@ class ImaginationActorCritic(ActingModel):
         self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers, self.discrete)
         self.critic = ScalarHead(features, control_dim, critic_layers)
         self.continues = ScalarHead(features, control_dim, self.reward_layers) if continuation else None
-        self.foresees_ends = continuation
         for network in filter(None, (self.actor, self.critic, self.continues)):
             activate(network, self.activation)
         self.trajectories, self.horizon, self.discount, self.lambda_ = trajectories, horizon, discount, lambda_
         self.actor_rate, self.critic_rate, self.actor_entropy = actor_rate, critic_rate, actor_entropy
+
+    @property
+    def foresees_ends(self) -> bool:
+        """See `ActingModel.foresees_ends`."""
+        return self.continues is not None
 
     def choose(self, exploring: bool) -> Choice:
         """See `ActingModel.choose`: a draw with noise, or the mode."""
@@ -125,7 +129,7 @@ class ImaginationActorCritic(ActingModel):
             surprises.append(-log_prob)
             return action
 
-        with frozen(*filter(None, (self.model, self.reward, self.critic, self.continues))):
+        with frozen(*self._world(), self.critic):
             features = self.model.roll(start, act, self.horizon).features  # (N B T, H, F)
             discount = self._discount(features)
             returns = lambda_returns(self.reward(features), self.critic(features), discount, self.lambda_)
@@ -136,6 +140,10 @@ class ImaginationActorCritic(ActingModel):
             returns = returns + self.actor_entropy * entropy
         return actor_loss(returns, discount, valid), critic
 
+    def _world(self) -> list[nn.Module]:
+        """Give what the model's loss trains."""
+        return [part for part in (self.model, self.reward, self.continues) if part is not None]
+
     def _discount(self, features: Tensor) -> Tensor:
         """Give the discounts of imagined trajectories, `(*, H, F)` to `(*, H)` or, all alike, `(H,)`."""
         if self.continues is None:
@@ -145,9 +153,8 @@ class ImaginationActorCritic(ActingModel):
 
     def groups(self) -> list[Group]:
         """See `WorldModel.groups`: three, so that no gradient is scaled down for another's sake."""
-        world: list[nn.Module | None] = [self.model, self.reward, self.continues]
         return [
-            Group("model", [p for part in world if part is not None for p in part.parameters()], self.learning_rate),
+            Group("model", [p for part in self._world() for p in part.parameters()], self.learning_rate),
             Group("actor", [*self.actor.parameters()], self.actor_rate),
             Group("critic", [*self.critic.parameters()], self.critic_rate),
         ]

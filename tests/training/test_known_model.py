@@ -185,6 +185,19 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_weights_and_runs_through_the
     assert {"train/loss", "val/loss", "val/state_nll"} <= set(read_metrics(resumed).columns)
 
 
+def test_a_resumed_run_learns_at_the_rate_it_is_given(config, tmp_path):
+    """At one that is lost in a float it stays what it was."""
+    run = tmp_path / "run"
+    assert main(["fit", "--config", config, "--run_dir", str(run)]) == 0
+    before = read_checkpoint(RunFolder(run).checkpoint)["state_dict"]
+    flags = ["--model.learning_rate", "1e-30", "--trainer.max_epochs", "3"]
+    assert main(["fit", "--resume", str(run), *flags]) == 0
+
+    checkpoint = read_checkpoint(RunFolder(run).checkpoint)
+    assert checkpoint["epoch"] == 2
+    torch.testing.assert_close(checkpoint["state_dict"], before, rtol=0, atol=0)
+
+
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
