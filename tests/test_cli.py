@@ -257,7 +257,8 @@ def test_the_other_loops_need_a_trained_model(command, tiny_config, capsys):
 
 TOYS = ["--allow-module", "toy_environments"]
 SHORT_EPISODES = {  # what an agent's configuration spends on playing
-    "evaluation_episodes: 20": "evaluation_episodes: 1, seed_episodes: 1",
+    "seed_episodes: 25": "seed_episodes: 1",
+    "evaluation_episodes: 20": "evaluation_episodes: 1",
     "candidates: 200": "candidates: 20",
     "iterations: 5": "iterations: 1",
     "{class_path: Collect}": "{class_path: Collect, init_args: {seed_episodes: 1}}",
