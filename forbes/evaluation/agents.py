@@ -27,6 +27,10 @@ from forbes.training.run_folder import RunFolder
 __all__ = ["evaluate_agents", "is_agent", "play_test_episode"]
 
 
+_APART = ("made_by", "shows", "observation_shape")
+"""In what environments of one task may differ: an agent that is shown the exact belief earns the same rewards."""
+
+
 class _Played(NamedTuple):
     """A run and the episodes it was measured in."""
 
@@ -46,7 +50,7 @@ def is_agent(run: str) -> bool:
 
 
 def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, command: str) -> None:
-    """Let every agent play the same episodes, record their returns in the run folders, and print a table.
+    """Let every agent play the same episodes, record its returns in its run folder, and print a table.
 
     Episode k of every run is reset with the same seed, none of which was used in a training. The action is the policy's
     mode, or the plan, without noise.
@@ -63,31 +67,30 @@ def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, 
     """
     if episodes < 2:
         raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
-    played = []
+    name, played = f"return[episodes={episodes}]", list[_Played]()
     for run in runs:
-        played.append(_play(run, episodes, seed, device))
-        _require_same_task(played[0], played[-1])
-    name = f"return[episodes={episodes}]"
-    for one in played:
-        entry = {
-            **Estimate.of(one.returns)._asdict(),
-            "interval_95": bootstrap_interval(one.returns),
-            "returns": one.returns.tolist(),
-            "environment": one.environment,
-            "checkpoint": RunFolder(one.run).checkpoint_sha256(),
-            "command": command,
-            "commit": commit(),
-            "seed": seed,
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        }
-        write_record(one.run, {name: entry}, {name: one.returns})
+        with loaded_agent(run, device) as (agent, environment):
+            one = _Played(run, agent, torch.empty(0), describe_environment(environment))
+            _require_same_task((played or [one])[0], one)
+            returns = [play_test_episode(agent, environment, seed, k).total_reward for k in _counted(run, episodes)]
+        played.append(one._replace(returns=torch.tensor(returns, dtype=torch.float64)))
+        _record(played[-1], name, seed, command)
     _print(played, name)
 
 
-def _play(run: str, episodes: int, seed: int, device: str) -> _Played:
-    with loaded_agent(run, device) as (agent, environment):
-        returns = [play_test_episode(agent, environment, seed, k).total_reward for k in _counted(run, episodes)]
-        return _Played(run, agent, torch.tensor(returns, dtype=torch.float64), describe_environment(environment))
+def _record(one: _Played, name: str, seed: int, command: str) -> None:
+    entry = {
+        **Estimate.of(one.returns)._asdict(),
+        "interval_95": bootstrap_interval(one.returns),
+        "returns": one.returns.tolist(),
+        "environment": one.environment,
+        "checkpoint": RunFolder(one.run).checkpoint_sha256(),
+        "command": command,
+        "commit": commit(),
+        "seed": seed,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    write_record(one.run, {name: entry}, {name: one.returns})
 
 
 def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int) -> Episode:
@@ -103,7 +106,7 @@ def _counted(run: str, episodes: int) -> Iterator[int]:
 
 
 def _require_same_task(first: _Played, other: _Played) -> None:
-    ours, theirs = ({k: v for k, v in one.environment.items() if k != "made_by"} for one in (first, other))
+    ours, theirs = ({k: v for k, v in one.environment.items() if k not in _APART} for one in (first, other))
     if ours != theirs:
         raise ForbesError(
             f"{other.run}: its task is {theirs['task']} ({theirs}), that of {first.run} is {ours['task']} ({ours}), "

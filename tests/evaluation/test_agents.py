@@ -55,6 +55,19 @@ def test_every_agent_plays_the_same_episodes(run, tmp_path, capsys):
     assert "paired: 0.00 ± 0.00" in " ".join(capsys.readouterr().out.split())
 
 
+def test_an_agent_is_held_against_one_that_is_shown_something_else(tmp_path, capsys):
+    """What one is shown changes nothing of what is paid, so the difference has a meaning."""
+    task = ("--data.source.task", "tiger", "--trainer.max_epochs", 1)
+    runs = [tmp_path / shown for shown in ("observation", "exact_belief")]
+    for run in runs:
+        options = ("--data.source.options", f"{{shows: {run.name}}}")
+        assert fit("--config", write_config(tmp_path), *task, *options, "--run_dir", run) == 0
+
+    assert forbes("evaluate", *runs, "--episodes", 2) == 0
+
+    assert f"{runs[0]} minus {runs[1]}, paired:" in " ".join(capsys.readouterr().out.split())
+
+
 def test_refuses_what_cannot_be_compared(run, tiny_run, tmp_path, capsys):
     shutil.copytree(run, other := tmp_path / "other")
     (other / "evaluation.json").unlink(missing_ok=True)
@@ -67,5 +80,7 @@ def test_refuses_what_cannot_be_compared(run, tiny_run, tmp_path, capsys):
         ((run, "--episodes", 1), "--episodes 1: a standard error needs at least 2"),
     ]:
         assert forbes("evaluate", *arguments) == 2
-        assert message in capsys.readouterr().err
+        assert message in (err := capsys.readouterr().err)
+        assert f"{other}: 1/" not in err  # it says so before it plays
     assert not (other / "evaluation.json").exists()
+    assert read_record(str(run))["return[episodes=10]"]  # and what was played before is kept
