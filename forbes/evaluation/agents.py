@@ -26,7 +26,6 @@ from forbes.training.run_folder import RunFolder
 
 __all__ = ["evaluate_agents", "is_agent", "play_test_episode"]
 
-
 _APART = ("made_by", "shows", "observation_shape")
 """In what environments of one task may differ: an agent that is shown the exact belief earns the same rewards."""
 
@@ -70,10 +69,11 @@ def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, 
     name, played = f"return[episodes={episodes}]", list[_Played]()
     for run in runs:
         with loaded_agent(run, device) as (agent, environment):
-            one = _Played(run, agent, torch.empty(0), describe_environment(environment))
-            _require_same_task((played or [one])[0], one)
+            task = describe_environment(environment)
+            for first in played[:1]:
+                _require_same_task(first, run, task)
             returns = [play_test_episode(agent, environment, seed, k).total_reward for k in _counted(run, episodes)]
-        played.append(one._replace(returns=torch.tensor(returns, dtype=torch.float64)))
+        played.append(_Played(run, agent, torch.tensor(returns, dtype=torch.float64), task))
         _record(played[-1], name, seed, command)
     _print(played, name)
 
@@ -105,11 +105,11 @@ def _counted(run: str, episodes: int) -> Iterator[int]:
         print(f"{run}: {number + 1}/{episodes} episodes", file=sys.stderr, flush=True)
 
 
-def _require_same_task(first: _Played, other: _Played) -> None:
-    ours, theirs = ({k: v for k, v in one.environment.items() if k not in _APART} for one in (first, other))
+def _require_same_task(first: _Played, run: str, task: dict[str, Any]) -> None:
+    ours, theirs = ({k: v for k, v in each.items() if k not in _APART} for each in (first.environment, task))
     if ours != theirs:
         raise ForbesError(
-            f"{other.run}: its task is {theirs['task']} ({theirs}), that of {first.run} is {ours['task']} ({ours}), "
+            f"{run}: its task is {theirs['task']} ({theirs}), that of {first.run} is {ours['task']} ({ours}), "
             "expected the same. Compare agents of one task"
         )
 
