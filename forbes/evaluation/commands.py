@@ -62,8 +62,8 @@ pll, fivo and open-loop take the first {_SUBSET} sequences, and their names say 
 evaluation.npz with each sequence's scores, into each run folder. Interrupted, the same command goes on where it
 stopped.
 
-Agents play --episodes without exploration, the same ones for all, whatever each is shown; their score is the return. It is
-kept as each agent ends; interrupted, all play again.
+Agents play --episodes without exploration, the same ones for all, whatever each is shown; their score is the return.
+It is kept as each agent ends; interrupted, all play again.
 
 On digit strokes and one core, elbo takes some 4 minutes a run, pll 5, fivo 3, and open-loop 20, in proportion to
 --futures and --digits."""
