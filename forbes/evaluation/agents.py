@@ -18,7 +18,9 @@ from forbes.data.episodes import Episode
 from forbes.envs import Environment
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
+from forbes.evaluation.foresight import SAMPLES, STEPS_AHEAD, explained, foretell
 from forbes.evaluation.record import write_record
+from forbes.seeding import derive_seed
 from forbes.training.acting import ActingModel, play_measured
 from forbes.training.loading import load_run, loaded_agent
 from forbes.training.provenance import commit
@@ -37,6 +39,8 @@ class _Played(NamedTuple):
     agent: ActingModel
     returns: Tensor
     """Undiscounted, `(E,)`, float64."""
+    explained: list[Estimate | None]
+    """The share of the rewards' variance that the world model foretold, for each of `STEPS_AHEAD`."""
     environment: dict[str, Any]
 
 
@@ -72,17 +76,25 @@ def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, 
             task = describe_environment(environment)
             for first in played[:1]:
                 _require_same_task(first, run, task)
-            returns = [play_test_episode(agent, environment, seed, k).total_reward for k in _counted(run, episodes)]
-        played.append(_Played(run, agent, torch.tensor(returns, dtype=torch.float64), task))
+            played.append(_play(run, agent, environment, episodes, seed))
         _record(played[-1], name, seed, command)
     _print(played, name)
 
 
+def _play(run: str, agent: ActingModel, environment: Environment, episodes: int, seed: int) -> _Played:
+    returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
+    for number in _counted(run, episodes):
+        episode = play_test_episode(agent, environment, seed, number)
+        returns.append(episode.total_reward)
+        rewards.append(torch.from_numpy(episode.reward[1:].astype("float64")))  # (T,)
+        draws = derive_seed(seed, "foresight", number)
+        foretold.append(foretell(agent, episode, draws, f"{run}, test episode {number}"))
+    total = torch.tensor(returns, dtype=torch.float64)  # (E,)
+    return _Played(run, agent, total, explained(foretold, rewards), describe_environment(environment))
+
+
 def _record(one: _Played, name: str, seed: int, command: str) -> None:
-    entry = {
-        **Estimate.of(one.returns)._asdict(),
-        "interval_95": bootstrap_interval(one.returns),
-        "returns": one.returns.tolist(),
+    measured = {
         "environment": one.environment,
         "checkpoint": RunFolder(one.run).checkpoint_sha256(),
         "command": command,
@@ -90,7 +102,17 @@ def _record(one: _Played, name: str, seed: int, command: str) -> None:
         "seed": seed,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    write_record(one.run, {name: entry}, {name: one.returns})
+    entry = {
+        **Estimate.of(one.returns)._asdict(),
+        "interval_95": bootstrap_interval(one.returns),
+        "returns": one.returns.tolist(),
+    }
+    shares = {
+        f"reward_explained[ahead={distance},S={SAMPLES},episodes={len(one.returns)}]": share._asdict() | measured
+        for distance, share in zip(STEPS_AHEAD, one.explained, strict=True)
+        if share is not None
+    }
+    write_record(one.run, {name: entry | measured} | shares, {name: one.returns})
 
 
 def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int) -> Episode:
@@ -125,6 +147,17 @@ def _print(played: Sequence[_Played], name: str) -> None:
         kind = f"{type(one.agent).__name__}, {type(one.agent.model.posterior).__name__}"
         table.add_row(escape(one.run), kind, f"{size:,}", str(Estimate.of(one.returns)), *ends)
     console.print(table)
+    console.print(_foresight(played))
     for first, second in itertools.combinations(played, 2):
         difference = Estimate.of(first.returns - second.returns)
         console.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
+
+
+def _foresight(played: Sequence[_Played]) -> Table:
+    title = "share of the rewards' variance in these episodes that the world model foretells, by the actions taken"
+    table = Table("run", title=f"{title}; 0 is as good as the mean reward")
+    for distance in STEPS_AHEAD:
+        table.add_column(f"{distance} steps ahead" if distance else "when seen", justify="right")
+    for one in played:
+        table.add_row(escape(one.run), *("n/a" if share is None else str(share) for share in one.explained))
+    return table

@@ -1,0 +1,91 @@
+"""How much of the reward an agent's world model foresees, in episodes it has not learned from."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from forbes.data.episodes import Episode
+from forbes.errors import ForbesError
+from forbes.evaluation.estimates import Estimate
+from forbes.models import State
+from forbes.training.acting import ActingModel
+
+__all__ = ["SAMPLES", "STEPS_AHEAD", "explained", "foretell"]
+
+STEPS_AHEAD = (0, 1, 5, 15)
+"""k; 0 is the reward that comes with the observation the belief has just seen, 15 the horizon of imagination."""
+SAMPLES = 16
+"""S, trajectories of the belief."""
+
+
+@torch.no_grad()
+def foretell(agent: ActingModel, episode: Episode, seed: int, name: str) -> list[Tensor]:
+    r"""Foretell every reward of an episode from the belief of k steps before, by the actions that were taken.
+
+    .. math:: \hat r_{t \mid t-k} = \tfrac1S \sum_{i=1}^S \hat r(f_t^i), \qquad
+              f_{t-k}^i \sim q(\cdot \mid o_{1:t-k}, a_{1:t-k-1}), \quad f_t^i \text{ by the prior and } a_{t-k:t-1}
+
+    A model that has learned its episodes by heart gives rewards of another one that are further off than their mean.
+
+    Args:
+        agent: in eval mode.
+        episode: of T actions.
+        seed: of the draws.
+        name: of the episode, for errors.
+
+    Returns:
+        For each k of `STEPS_AHEAD` the rewards of the last steps, in units of reward, float64: `(T,)` where k is 0,
+        else `(T - k + 1,)`, or `(0,)` where the episode is too short.
+
+    Raises:
+        ForbesError: where the model foretells what is not a finite number.
+    """
+    device = next(agent.parameters()).device
+    steps, furthest = len(episode.reward) - 1, max(STEPS_AHEAD)
+    observation = torch.from_numpy(episode.observation.copy()).to(device)[None]  # (1, T + 1, *O)
+    action = torch.from_numpy(episode.action.copy()).to(device)[None]  # (1, T + 1, A)
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        embedding = agent.model.embed(observation).expand(SAMPLES, -1, -1)  # (S, T + 1, E)
+        filtered = agent.model.filter(embedding, action.expand(SAMPLES, -1, -1))
+        start = State(filtered.hidden[:, :-1].flatten(0, 1), filtered.state[:, :-1].flatten(0, 1))  # (S T, ...)
+        taken = torch.cat((action[0, 1:], action.new_zeros(furthest - 1, action.shape[-1])))  # (T + K - 1, A)
+        taken = taken.unfold(0, furthest, 1).transpose(1, 2).repeat(SAMPLES, 1, 1)  # (S T, K, A)
+        later = agent.reward(agent.model.imagine(start, taken).features)  # (S T, K)
+    now = agent.reward(filtered.features)[:, 1:].double().mean(0).cpu()  # (T,)
+    later = later.unflatten(0, (SAMPLES, steps)).double().mean(0).cpu()  # (T, K)
+    if not (now.isfinite().all() and later.isfinite().all()):
+        raise ForbesError(
+            f"{name}: the world model foretells rewards that are not finite numbers. The training diverged: "
+            "train again with a smaller learning_rate"
+        )
+    return [later[: max(steps - k + 1, 0), k - 1] if k else now for k in STEPS_AHEAD]
+
+
+def explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor]) -> list[Estimate | None]:
+    r"""Give the share of the rewards' variance that was foretold, for each of `STEPS_AHEAD`.
+
+    .. math:: R^2_k = 1 - \frac{\sum (r_t - \hat r_{t \mid t-k})^2}{\sum (r_t - \bar r)^2}
+
+    1 is perfect, 0 as good as always foretelling the mean; the error is that of a ratio, over episodes.
+
+    Args:
+        foretold: by `foretell`, of E episodes.
+        rewards: r_2 to r_{T+1} of each, `(T,)`, float64.
+
+    Returns:
+        For each k; None where no episode is that long, or all rewards are the same.
+    """
+    return [_explained(told, rewards) for told in zip(*foretold, strict=True)]
+
+
+def _explained(foretold: Sequence[Tensor], rewards: Sequence[Tensor]) -> Estimate | None:
+    paid = [one[len(one) - len(told) :] for told, one in zip(foretold, rewards, strict=True)]
+    mean = torch.cat(paid).mean()
+    missed = torch.stack([(one - told).square().sum() for told, one in zip(foretold, paid, strict=True)])  # (E,)
+    there = torch.stack([(one - mean).square().sum() for one in paid])  # (E,)
+    if not there.sum() > 0:
+        return None
+    share, error = Estimate.per_step(missed, there)
+    return Estimate(1 - share, error)
