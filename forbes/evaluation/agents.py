@@ -86,7 +86,7 @@ def _play(run: str, agent: ActingModel, environment: Environment, episodes: int,
     for number in _counted(run, episodes):
         episode = play_test_episode(agent, environment, seed, number)
         returns.append(episode.total_reward)
-        rewards.append(torch.from_numpy(episode.reward[1:].astype("float64")))  # (T,)
+        rewards.append(torch.from_numpy(episode.reward[1:]).double())  # (T,)
         draws = derive_seed(seed, "foresight", number)
         foretold.append(foretell(agent, episode, draws, f"{run}, test episode {number}"))
     total = torch.tensor(returns, dtype=torch.float64)  # (E,)

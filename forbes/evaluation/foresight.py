@@ -11,7 +11,7 @@ from forbes.evaluation.estimates import Estimate
 from forbes.models import State
 from forbes.training.acting import ActingModel
 
-__all__ = ["SAMPLES", "STEPS_AHEAD", "explained", "foretell"]
+__all__ = ["SAMPLES", "STEPS_AHEAD", "explained", "foretell", "share_explained"]
 
 STEPS_AHEAD = (0, 1, 5, 15)
 """k; 0 is the reward that comes with the observation the belief has just seen, 15 the horizon of imagination."""
@@ -71,21 +71,31 @@ def explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor]) -
     1 is perfect, 0 as good as always foretelling the mean; the error is that of a ratio, over episodes.
 
     Args:
-        foretold: by `foretell`, of E episodes.
+        foretold: by `foretell`, of E episodes, at least 2.
         rewards: r_2 to r_{T+1} of each, `(T,)`, float64.
 
     Returns:
         For each k; None where no episode is that long, or all rewards are the same.
     """
-    return [_explained(told, rewards) for told in zip(*foretold, strict=True)]
+    return [_estimate(*_squares(told, rewards)) for told in zip(*foretold, strict=True)]
 
 
-def _explained(foretold: Sequence[Tensor], rewards: Sequence[Tensor]) -> Estimate | None:
-    paid = [one[len(one) - len(told) :] for told, one in zip(foretold, rewards, strict=True)]
-    mean = torch.cat(paid).mean()
-    missed = torch.stack([(one - told).square().sum() for told, one in zip(foretold, paid, strict=True)])  # (E,)
-    there = torch.stack([(one - mean).square().sum() for one in paid])  # (E,)
+def share_explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor], distance: int) -> float | None:
+    """Give the share of one distance, one of `STEPS_AHEAD`, as `explained` does; without the error one episode will do."""
+    missed, there = _squares([one[STEPS_AHEAD.index(distance)] for one in foretold], rewards)
+    return 1 - (missed.sum() / there.sum()).item() if there.sum() > 0 else None
+
+
+def _estimate(missed: Tensor, there: Tensor) -> Estimate | None:
     if not there.sum() > 0:
         return None
     share, error = Estimate.per_step(missed, there)
     return Estimate(1 - share, error)
+
+
+def _squares(foretold: Sequence[Tensor], rewards: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Sum the squares of what was missed and of what there was to foretell, `(E,)` each."""
+    paid = [one[len(one) - len(told) :] for told, one in zip(foretold, rewards, strict=True)]
+    mean = torch.cat(paid).mean()
+    missed = torch.stack([(one - told).square().sum() for told, one in zip(foretold, paid, strict=True)])  # (E,)
+    return missed, torch.stack([(one - mean).square().sum() for one in paid])  # (E,)

@@ -73,9 +73,10 @@ class PlainProgress(ProgressBar):
 
 
 def _objectives(trainer: Trainer, module: LightningModule) -> dict[str, float]:
-    """Give the newest bound, or loss in nats per step, of each split, and the returns of an agent."""
+    """Give the newest bound, or loss in nats per step, of each split, and what an agent earns and foresees."""
     objective = getattr(module, "objective_name", "loss")  # a module of somebody else's may have none
-    metrics = trainer.callback_metrics.items()
     return {
-        name: float(value) for name, value in metrics if name.endswith(f"/{objective}") or name.startswith("return/")
+        name: float(value)
+        for name, value in trainer.callback_metrics.items()
+        if name.endswith(f"/{objective}") or name.startswith(("return/", "reward_explained/"))
     }

@@ -9,8 +9,12 @@ import torch
 from small_agents import fit, forbes, write_config
 
 from forbes.data.episode_store import EpisodeStore
+from forbes.evaluation.foresight import foretell, share_explained
+from forbes.seeding import derive_seed
 from forbes.training import ImaginationActorCritic
+from forbes.training.acting import play_measured
 from forbes.training.checkpoint import read_checkpoint
+from forbes.training.loading import load_run
 from forbes.training.run_folder import RunFolder, read_metrics
 
 
@@ -44,6 +48,20 @@ def test_the_returns_are_those_of_the_episodes(run):
     exploring = metrics["return/exploring"].dropna()
     np.testing.assert_allclose(exploring, [records[2].total_reward, records[3].total_reward], rtol=1e-6)
     assert metrics["return/acting"].notna().sum() == 2  # after epochs 2 and 3, the last
+
+
+def test_what_the_model_foresees_is_that_of_the_episodes_that_measure_the_agent(run):
+    """By the weights of the end, which are those of the last measurement."""
+    module, data = load_run(run)
+    played = [play_measured(module, data.source.environment, "evaluation", 0, number) for number in range(2)]
+    data.source.close()
+
+    told = [foretell(module, one, derive_seed(0, "foresight", number), "") for number, one in enumerate(played)]
+    share = share_explained(told, [torch.from_numpy(one.reward[1:]).double() for one in played], 5)
+
+    logged = read_metrics(run)["reward_explained/5"].dropna()
+    assert len(logged) == 2  # after epochs 2 and 3, the last
+    assert logged.iloc[-1] == pytest.approx(share, rel=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["dreamer", "planet"])

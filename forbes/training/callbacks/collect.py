@@ -6,15 +6,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
+import torch
 from lightning import Callback, LightningModule, Trainer
 
 from forbes.data import Experience
 from forbes.data.collection import random_policy
 from forbes.data.episodes import Episode
 from forbes.errors import ForbesError
+from forbes.evaluation.foresight import foretell, share_explained
+from forbes.seeding import derive_seed
 from forbes.training.acting import Acting, ActingModel, play_measured
 
 __all__ = ["Collect", "require_agent"]
+
+_AHEAD = 5  # steps: far enough for what actions do to matter, near enough for most episodes
 
 
 class Collect(Callback):
@@ -28,7 +33,9 @@ class Collect(Callback):
     began: always one epoch older than it would be otherwise, and so no less reproducible.
 
     Logs, at the end of the epoch: `env_steps` (frames of the simulator, action repeat included), `agent_steps`,
-    `return/exploring` of the newest episode, and `return/acting`, the mean return of episodes without exploration.
+    `return/exploring` of the newest episode, and of episodes without exploration, which the agent does not learn from,
+    their mean `return/acting` and `reward_explained/5`, the share of their rewards' variance that the world model
+    foretells 5 steps ahead (`forbes.evaluation.foresight`): near 0 or below, it knows its own episodes by heart.
 
     Args:
         seed_episodes: S.
@@ -97,7 +104,14 @@ class Collect(Callback):
             return
         with _eval_mode(agent):
             played = [self.evaluation_episode(trainer, agent, k) for k in range(self.evaluation_episodes)]
+            told = [
+                foretell(agent, episode, derive_seed(self.seed, "foresight", k), f"evaluation episode {k}")
+                for k, episode in enumerate(played)
+            ]
         agent.log("return/acting", sum(episode.total_reward for episode in played) / len(played), batch_size=1)
+        share = share_explained(told, [torch.from_numpy(episode.reward[1:]).double() for episode in played], _AHEAD)
+        if share is not None:
+            agent.log(f"reward_explained/{_AHEAD}", share, batch_size=1)
 
     def evaluation_episode(self, trainer: Trainer, agent: ActingModel, number: int) -> Episode:
         """Play one of the episodes that measure an agent, in eval mode, while it learns: the same each time."""
