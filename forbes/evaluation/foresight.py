@@ -81,7 +81,7 @@ def explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor]) -
 
 
 def share_explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor], distance: int) -> float | None:
-    """Give the share of one distance, one of `STEPS_AHEAD`, as `explained` does; without the error one episode will do."""
+    """Give the share of one of `STEPS_AHEAD` as `explained` does; without an error, so that one episode will do."""
     missed, there = _squares([one[STEPS_AHEAD.index(distance)] for one in foretold], rewards)
     return 1 - (missed.sum() / there.sum()).item() if there.sum() > 0 else None
 
