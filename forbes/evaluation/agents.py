@@ -95,7 +95,6 @@ def _play(run: str, agent: ActingModel, environment: Environment, episodes: int,
 
 def _record(one: _Played, name: str, seed: int, command: str) -> None:
     measured = {
-        "environment": one.environment,
         "checkpoint": RunFolder(one.run).checkpoint_sha256(),
         "command": command,
         "commit": commit(),
@@ -106,6 +105,7 @@ def _record(one: _Played, name: str, seed: int, command: str) -> None:
         **Estimate.of(one.returns)._asdict(),
         "interval_95": bootstrap_interval(one.returns),
         "returns": one.returns.tolist(),
+        "environment": one.environment,
     }
     shares = {
         f"reward_explained[ahead={distance},S={SAMPLES},episodes={len(one.returns)}]": share._asdict() | measured

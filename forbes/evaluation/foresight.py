@@ -26,7 +26,7 @@ def foretell(agent: ActingModel, episode: Episode, seed: int, name: str) -> list
     .. math:: \hat r_{t \mid t-k} = \tfrac1S \sum_{i=1}^S \hat r(f_t^i), \qquad
               f_{t-k}^i \sim q(\cdot \mid o_{1:t-k}, a_{1:t-k-1}), \quad f_t^i \text{ by the prior and } a_{t-k:t-1}
 
-    A model that has learned its episodes by heart gives rewards of another one that are further off than their mean.
+    A model that has learned its episodes by heart foretells another one's rewards no better than their mean does.
 
     Args:
         agent: in eval mode.
