@@ -73,9 +73,8 @@ def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, 
     name, played = f"return[episodes={episodes}]", list[_Played]()
     for run in runs:
         with loaded_agent(run, device) as (agent, environment):
-            task = describe_environment(environment)
             for first in played[:1]:
-                _require_same_task(first, run, task)
+                _require_same_task(first, run, describe_environment(environment))
             played.append(_play(run, agent, environment, episodes, seed))
         _record(played[-1], name, seed, command)
     _print(played, name)

@@ -64,8 +64,8 @@ stopped.
 
 Agents play --episodes without exploration, the same ones for all, whatever each is shown; their score is the return.
 Beside it stands what share of the rewards' variance in these episodes the world model foretells, from its belief and 1,
-5 and 15 steps ahead by the actions taken: near 0 or below it, the model knows the episodes it was trained on by heart,
-and needs more of them. Both are kept as each agent ends; interrupted, all play again.
+5 and 15 steps ahead by the actions taken: 1 is perfect, 0 no better than the mean reward, as of a model that knows its
+own episodes by heart, or where rewards hardly vary. Both are kept as each agent ends; interrupted, all play again.
 
 On digit strokes and one core, elbo takes some 4 minutes a run, pll 5, fivo 3, and open-loop 20, in proportion to
 --futures and --digits."""

@@ -20,7 +20,9 @@ SAMPLES = 16
 
 
 @torch.no_grad()
-def foretell(agent: ActingModel, episode: Episode, seed: int, name: str) -> list[Tensor]:
+def foretell(
+    agent: ActingModel, episode: Episode, seed: int, name: str, ahead: Sequence[int] = STEPS_AHEAD
+) -> list[Tensor]:
     r"""Foretell every reward of an episode from the belief of k steps before, by the actions that were taken.
 
     .. math:: \hat r_{t \mid t-k} = \tfrac1S \sum_{i=1}^S \hat r(f_t^i), \qquad
@@ -33,16 +35,17 @@ def foretell(agent: ActingModel, episode: Episode, seed: int, name: str) -> list
         episode: of T actions.
         seed: of the draws.
         name: of the episode, for errors.
+        ahead: each k, one of them at least 1.
 
     Returns:
-        For each k of `STEPS_AHEAD` the rewards of the last steps, in units of reward, float64: `(T,)` where k is 0,
+        For each k the rewards of the last steps, in units of reward, float64: `(T,)` where k is 0,
         else `(T - k + 1,)`, or `(0,)` where the episode is too short.
 
     Raises:
         ForbesError: where the model foretells what is not a finite number.
     """
     device = next(agent.parameters()).device
-    steps, furthest = len(episode.reward) - 1, max(STEPS_AHEAD)
+    steps, furthest = len(episode.reward) - 1, max(ahead)
     observation = torch.from_numpy(episode.observation.copy()).to(device)[None]  # (1, T + 1, *O)
     action = torch.from_numpy(episode.action.copy()).to(device)[None]  # (1, T + 1, A)
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
@@ -60,11 +63,11 @@ def foretell(agent: ActingModel, episode: Episode, seed: int, name: str) -> list
             f"{name}: the world model foretells rewards that are not finite numbers. The training diverged: "
             "train again with a smaller learning_rate"
         )
-    return [later[: max(steps - k + 1, 0), k - 1] if k else now for k in STEPS_AHEAD]
+    return [later[: max(steps - k + 1, 0), k - 1] if k else now for k in ahead]
 
 
 def explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor]) -> list[Estimate | None]:
-    r"""Give the share of the rewards' variance that was foretold, for each of `STEPS_AHEAD`.
+    r"""Give the share of the rewards' variance that was foretold, for each distance k.
 
     .. math:: R^2_k = 1 - \frac{\sum (r_t - \hat r_{t \mid t-k})^2}{\sum (r_t - \bar r)^2}
 
@@ -80,9 +83,9 @@ def explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor]) -
     return [_estimate(*_squares(told, rewards)) for told in zip(*foretold, strict=True)]
 
 
-def share_explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor], distance: int) -> float | None:
-    """Give the share of one of `STEPS_AHEAD` as `explained` does; without an error, so that one episode will do."""
-    missed, there = _squares([one[STEPS_AHEAD.index(distance)] for one in foretold], rewards)
+def share_explained(foretold: Sequence[Tensor], rewards: Sequence[Tensor]) -> float | None:
+    """Give the share of one distance as `explained` does; without an error, so that one episode will do."""
+    missed, there = _squares(foretold, rewards)
     return 1 - (missed.sum() / there.sum()).item() if there.sum() > 0 else None
 
 

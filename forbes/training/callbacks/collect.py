@@ -35,7 +35,7 @@ class Collect(Callback):
     Logs, at the end of the epoch: `env_steps` (frames of the simulator, action repeat included), `agent_steps`,
     `return/exploring` of the newest episode, and of episodes without exploration, which the agent does not learn from,
     their mean `return/acting` and `reward_explained/5`, the share of their rewards' variance that the world model
-    foretells 5 steps ahead (`forbes.evaluation.foresight`): near 0 or below, it knows its own episodes by heart.
+    foretells 5 steps ahead (`forbes.evaluation.foresight`).
 
     Args:
         seed_episodes: S.
@@ -105,11 +105,13 @@ class Collect(Callback):
         with _eval_mode(agent):
             played = [self.evaluation_episode(trainer, agent, k) for k in range(self.evaluation_episodes)]
             told = [
-                foretell(agent, episode, derive_seed(self.seed, "foresight", k), f"evaluation episode {k}")
+                foretell(agent, episode, derive_seed(self.seed, "foresight", k), f"evaluation episode {k}", (_AHEAD,))[
+                    0
+                ]
                 for k, episode in enumerate(played)
             ]
         agent.log("return/acting", sum(episode.total_reward for episode in played) / len(played), batch_size=1)
-        share = share_explained(told, [torch.from_numpy(episode.reward[1:]).double() for episode in played], _AHEAD)
+        share = share_explained(told, [torch.from_numpy(episode.reward[1:]).double() for episode in played])
         if share is not None:
             agent.log(f"reward_explained/{_AHEAD}", share, batch_size=1)
 
