@@ -38,7 +38,10 @@ def allow_modules(names: Sequence[str] = ()) -> None:
 def add_seed(parser: LightningArgumentParser) -> None:
     """Add the one seed of an experiment."""
     parser.add_argument(
-        "--seed_everything", type=int, default=0, help="seed of the weights, the noise and the order of the data"
+        "--seed_everything",
+        type=int,
+        default=0,
+        help="seed of the weights, the noise, the order of the data and an agent's episodes",
     )
 
 

@@ -32,6 +32,15 @@ def test_there_is_one_episode_before_each_epoch_and_the_seed_episodes_before_the
     assert len({record.seed for record in records}) == 4
 
 
+def test_trainings_of_different_seeds_live_through_different_episodes(run, tmp_path):
+    assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run", "--seed_everything", "1") == 0
+
+    stores = [EpisodeStore(folder / "episodes") for folder in (run, tmp_path / "run")]
+    first, second = ({record.seed for record in store.records.values()} for store in stores)
+    assert len(second) == 4
+    assert first.isdisjoint(second)
+
+
 def test_env_steps_agent_steps_and_updates_are_counted_apart(run):
     """An episode of the parrot has 8 steps of 3 frames each."""
     metrics = read_metrics(run)

@@ -8,6 +8,7 @@ from typing import cast
 
 import torch
 from lightning import Callback, LightningModule, Trainer
+from torch import Tensor
 
 from forbes.data import Experience
 from forbes.data.collection import random_policy
@@ -26,8 +27,8 @@ class Collect(Callback):
     r"""Collects the episodes that an agent learns from, and measures how it does.
 
     When epoch e begins, S + e episodes have been played: S by a random policy, the others by the agent as it then was,
-    with exploration. Episode n is a function of (seed, n) and the weights, so that a resumed run plays the same.
-    The store is the run folder's `episodes/`.
+    with exploration. Episode n is a function of (the training's seed, n) and the weights, so that a resumed run plays
+    the same. The store is the run folder's `episodes/`.
 
     With `overlap`, the episode that epoch e + 1 begins with is played during epoch e, by the agent as it was when e
     began: always one epoch older than it would be otherwise, and so no less reproducible.
@@ -41,7 +42,6 @@ class Collect(Callback):
         seed_episodes: S.
         evaluate_every: epochs between two evaluations, of which the last epoch has one.
         evaluation_episodes: of each; their seeds are those of no other episode, and the same each time.
-        seed: of all the episodes.
         overlap: play in a process of its own, on the CPU, while the agent learns.
 
     Raises:
@@ -53,14 +53,13 @@ class Collect(Callback):
         seed_episodes: int = 5,
         evaluate_every: int = 10,
         evaluation_episodes: int = 1,
-        seed: int = 0,
         overlap: bool = False,
     ) -> None:
         numbers = {"seed_episodes": seed_episodes, "evaluate_every": evaluate_every}
         for name, value in (numbers | {"evaluation_episodes": evaluation_episodes}).items():
             if value < 1:
                 raise ForbesError(f"Collect: {name} is {value}, expected at least 1")
-        self.seed_episodes, self.seed, self.overlap = seed_episodes, seed, overlap
+        self.seed_episodes, self.overlap = seed_episodes, overlap
         self.evaluate_every, self.evaluation_episodes = evaluate_every, evaluation_episodes
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -81,14 +80,14 @@ class Collect(Callback):
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play what is missing."""
         source, agent = _experience(trainer), cast(ActingModel, pl_module)
-        for record in source.collect(self.seed_episodes, random_policy, "random", self.seed):
+        for record in source.collect(self.seed_episodes, random_policy, "random", agent.seed):
             _say(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
         with _eval_mode(agent):
             until = self.seed_episodes + trainer.current_epoch
-            list(source.collect(until, Acting(agent, exploring=True), type(agent).__name__, self.seed))
+            list(source.collect(until, Acting(agent, exploring=True), type(agent).__name__, agent.seed))
         _warn_of_ends(source, agent)
         if self.overlap:
-            source.begin(Acting.as_it_is(agent, exploring=True), self.seed)
+            source.begin(Acting.as_it_is(agent, exploring=True), agent.seed)
         steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
         if source.newest.number >= self.seed_episodes:
             steps["return/exploring"] = source.newest.total_reward
@@ -98,26 +97,26 @@ class Collect(Callback):
         """Store the episode played meanwhile; measure the agent every few epochs, and at the end."""
         agent, source = cast(ActingModel, pl_module), _experience(trainer)
         if self.overlap:
-            source.finish(type(agent).__name__, self.seed)
+            source.finish(type(agent).__name__, agent.seed)
         number = trainer.current_epoch + 1
         if number % self.evaluate_every and number != trainer.max_epochs:
             return
         with _eval_mode(agent):
             played = [self.evaluation_episode(trainer, agent, k) for k in range(self.evaluation_episodes)]
-            told = [
-                foretell(agent, episode, derive_seed(self.seed, "foresight", k), f"evaluation episode {k}", (_AHEAD,))[
-                    0
-                ]
-                for k, episode in enumerate(played)
-            ]
+            told = [self._foretold(agent, episode, k) for k, episode in enumerate(played)]
         agent.log("return/acting", sum(episode.total_reward for episode in played) / len(played), batch_size=1)
         share = share_explained(told, [torch.from_numpy(episode.reward[1:]).double() for episode in played])
         if share is not None:
             agent.log(f"reward_explained/{_AHEAD}", share, batch_size=1)
 
+    @staticmethod
+    def _foretold(agent: ActingModel, episode: Episode, number: int) -> Tensor:
+        seed = derive_seed(agent.seed, "foresight", number)
+        return foretell(agent, episode, seed, f"evaluation episode {number}", (_AHEAD,))[0]
+
     def evaluation_episode(self, trainer: Trainer, agent: ActingModel, number: int) -> Episode:
         """Play one of the episodes that measure an agent, in eval mode, while it learns: the same each time."""
-        return play_measured(agent, _experience(trainer).environment, "evaluation", self.seed, number)
+        return play_measured(agent, _experience(trainer).environment, "evaluation", agent.seed, number)
 
 
 def _warn_of_ends(source: Experience, agent: ActingModel) -> None:
