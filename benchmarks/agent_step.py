@@ -6,7 +6,8 @@
 In each round every form makes an update, and each of its parts once more by itself, one form after the other, so that
 whatever else the machine does meets them alike. Times are of the processor, or of the clock where a GPU works; ratios
 are medians over rounds. Batches are windows of stored random episodes, as in a training. The whole update is the two
-parts, and clipping and Adam. Acting is one choice of the agent for one observation.
+parts, and clipping and Adam; on a GPU also as `CudaGraph` plays it back. Acting is one choice of the agent for one
+observation.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -32,8 +34,9 @@ from forbes.envs import Environment, Step, find_environment
 from forbes.errors import ForbesError
 from forbes.models import MLPDecoder, MLPEncoder, VectorNormal
 from forbes.training import ImaginationActorCritic
+from forbes.training.callbacks.cuda_graph import record
 
-PARTS = ("loading", "model", "imagination", "update", "acting")
+PARTS = ("loading", "model", "imagination", "update", "recorded", "acting")
 EPISODES = 10
 NAMES = {"dreamer": "Dreamer, N = 1", "forbes": "FORBES, N = 1", "forbes4": "FORBES, N = 4"}
 
@@ -94,7 +97,7 @@ SHAPES = {
 class Work:
     """An agent of one form on a device, and each thing that it does again and again."""
 
-    def __init__(self, form: str, shape: Shape, data: SequenceDataModule, device: torch.device) -> None:
+    def __init__(self, form: str, shape: Shape, data: SequenceDataModule, device: torch.device, half: bool) -> None:
         torch.manual_seed(0)
         belief = GaussianBelief if form == "dreamer" else partial(FlowBelief, **shape.flow)
         sizes = {"observation_shape": data.observation_shape, "action_dim": data.action_dim, **shape.model}
@@ -102,13 +105,16 @@ class Work:
         self.agent = ImaginationActorCritic(trajectories=number, belief=belief, **sizes).to(device)
         for name in ("log", "log_dict"):  # there is no trainer to log to
             setattr(self.agent, name, lambda *_, **__: None)
-        self.data, self.device, self.number = data, device, 0
+        self.data, self.device, self.number, self.half = data, device, 0, half
         self.optimizer = self.agent.configure_optimizers()["optimizer"]
         self.acting = Agent(self.agent.model, self.agent.choose(exploring=True), seed=0)
         self.batch = self.loading()
         with torch.no_grad():
             seen = self.agent.model.see(self.batch.observation, self.batch.action)
             self.filtered = self.agent.model.filter(seen.embedding, seen.action)
+        self.losses = self.agent.losses
+        if device.type == "cuda":
+            self.losses = record(self.agent, self.batch, self.precision())
 
     def loading(self) -> SequenceBatch:
         """Draw a batch of windows from the store, and put it on the device."""
@@ -116,20 +122,34 @@ class Work:
         compact = self.data.source.gather("train", self.data.train_index(self.number), self.data.length)
         return self.data.source.decode(type(compact)(*(values.to(self.device) for values in compact)))
 
+    def precision(self) -> AbstractContextManager[object]:
+        """Give the context in which losses are computed, as Lightning's `bf16-mixed` has it."""
+        return torch.autocast("cuda", torch.bfloat16, cache_enabled=False) if self.half else nullcontext()
+
     def model(self) -> None:
         """Form the gradients of world model and reward."""
-        _, terms, reward = self.agent.explain(self.batch)
-        self._backward(self.agent.model_loss(terms, reward))
+        with self.precision():
+            _, terms, reward = self.agent.explain(self.batch)
+            loss, _ = self.agent.model_loss(terms, reward)
+        self._backward(loss)
 
     def imagination(self) -> None:
         """Imagine from beliefs that are there, and form the gradients of actor and critic."""
-        self._backward(sum(self.agent.control_losses(self.filtered, self.batch.mask)))
+        with self.precision():
+            loss = sum(self.agent.control_losses(self.filtered, self.batch.mask))
+        self._backward(loss)
 
     def update(self) -> None:
         """Make an update: the sum of all losses, gradients, clipping, Adam."""
-        self._backward(self.agent.training_step(self.batch, 0))
-        self.agent.configure_gradient_clipping(self.optimizer)
-        self.optimizer.step()
+        with self.precision():
+            loss, _ = self.agent.losses(self.batch)
+        self._step(loss)
+
+    def recorded(self) -> None:
+        """Make an update whose losses and gradients are played back; on a CPU, the same as any."""
+        if self.device.type == "cpu":
+            return
+        self._step(self.losses(self.batch)[0])
 
     def act(self) -> None:
         """Choose an action for one observation, as in a collected episode."""
@@ -143,8 +163,13 @@ class Work:
 
     def seconds(self) -> dict[str, float]:
         """Do everything once and say how long each took."""
-        works = (self.loading, self.model, self.imagination, self.update, self.act)
+        works = (self.loading, self.model, self.imagination, self.update, self.recorded, self.act)
         return {part: self._time(work) for part, work in zip(PARTS, works, strict=True)}
+
+    def _step(self, loss: Tensor) -> None:
+        self._backward(loss)
+        self.agent.configure_gradient_clipping(self.optimizer)
+        self.optimizer.step()
 
     def _backward(self, loss: Tensor) -> None:
         self.optimizer.zero_grad()
@@ -191,7 +216,7 @@ def measure(name: str, device: torch.device, options: argparse.Namespace) -> lis
         make = find_environment(options.task, size=size, fast=size < 64)
     with tempfile.TemporaryDirectory() as folder:
         data = stored(shape, folder)
-        works = {form: Work(form, shape, data, device) for form in NAMES}
+        works = {form: Work(form, shape, data, device, options.bf16) for form in NAMES}
         operations = {form: work.operations() for form, work in works.items()}
         rounds: dict[str, list[dict[str, float]]] = {form: [] for form in NAMES}
         say(f"{name}: {options.repeats} rounds")
@@ -207,7 +232,7 @@ def row(name: str, form: str, times: dict[str, dict[str, list[float]]], operatio
     """Write one row: milliseconds, then ratios of whole updates, round by round."""
     ours = times[form]
     milliseconds = " | ".join(
-        f"{1e3 * statistics.median(ours[part]):.1f}" for part in ("model", "imagination", "update")
+        f"{1e3 * statistics.median(ours[part]):.1f}" for part in ("model", "imagination", "update", "recorded")
     )
     over = " | ".join(f"{ratio(ours['update'], times[other]['update']):.2f}" for other in ("dreamer", "forbes"))
     loading = f"{1e3 * statistics.median(ours['loading']):.2f} ({ratio(ours['loading'], ours['update']):.1%})"
@@ -220,17 +245,20 @@ def main() -> None:
     parser = common_options(__doc__, 15, "rounds")
     parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=["hike", "pixels", "dmc"])
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--bf16", action="store_true", help="mixed precision, on a GPU")
+    parser.add_argument("--tf32", action="store_true", help="float32 products of less precision, on a GPU")
     parser.add_argument("--task", default="cartpole_swingup", help="of DeepMind Control, whose step is timed")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
+    torch.set_float32_matmul_precision("high" if options.tf32 else "highest")
     device = torch.device(options.device)
     machine = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.machine()
     table = [
         f"{conditions(options, machine)} Milliseconds; loading also as a share.",
         "",
-        "| shape | form | world model | imagination | update | over Dreamer | over N = 1 "
+        "| shape | form | world model | imagination | update | recorded | over Dreamer | over N = 1 "
         "| operations | loading | acting | environment |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for name in options.shapes:
         table += measure(name, device, options)

@@ -15,6 +15,7 @@ from torch.nn.functional import linear, pad, softplus
 
 from forbes.deferred import Affine, Bind
 from forbes.errors import ForbesError
+from forbes.fusion import fused
 
 __all__ = ["AffineCoupling", "ConditionalFlow", "Coupling", "CouplingFamily", "FlowMap", "LULinear", "bind_now"]
 
@@ -97,14 +98,14 @@ class Coupling(nn.Module, ABC):
         """Prepare the network but for its last layer: (x, share) to `(*, W)`."""
         inner, outer = bind(self.inner.weight, self.inner.bias), bind(self.outer.weight, self.outer.bias)
 
-        def block(hidden: Tensor) -> Tensor:
-            return hidden + outer(inner(hidden.relu()).relu())
+        def block(hidden: Tensor, active: Tensor) -> Tensor:
+            return hidden + outer(inner(active).relu())
 
         if self.first is None:
-            return lambda x, share: block(share)
+            return lambda x, share: block(share, share.relu())
         weight = pad(self.first.weight, (self.other, 0) if self.swap else (0, self.other))  # (W, D)
         first = bind(weight, weight.new_zeros(len(weight)))
-        return lambda x, share: block(first(x) + share)
+        return lambda x, share: block(*_join(first(x), share))
 
 
 class AffineCoupling(Coupling):
@@ -136,29 +137,22 @@ class AffineCoupling(Coupling):
         network = self._network(bind)
 
         def generate(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-            log_scale, shift = network(x, share)
-            return torch.addcmul(shift, x, log_scale.exp()), log_scale
+            return _move(x, network(x, share))
 
         return generate
 
     def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
         """See `Coupling.inverse`."""
-        log_scale, shift = self._network(bind_now)(y, share)
-        return (y - shift) * (-log_scale).exp(), log_scale
+        return _move_back(y, self._network(bind_now)(y, share))
 
-    def _network(self, bind: Bind) -> FlowMap:
-        """Prepare (x, share) -> (ℓ, t): shapes `(*, D)` and `(*, W)` to twice `(*, D)`, zeros for x_a."""
+    def _network(self, bind: Bind) -> Callable[[Tensor, Tensor], Tensor]:
+        """Prepare (x, share) -> (u/2, t): shapes `(*, D)` and `(*, W)` to `(*, 2 D)`, zeros for x_a."""
         hidden, around = self.hidden(bind), (0, self.given) if self.swap else (self.given, 0)
         rows = (0, 0, *around)
         weight = torch.cat((pad(self.log_scale.weight / LOG_SCALE_BOUND, rows), pad(self.shift.weight, rows)))
         bias = torch.cat((pad(self.log_scale.bias / LOG_SCALE_BOUND, around), pad(self.shift.bias, around)))
         last = bind(weight, bias)  # (2 D, W), (2 D,)
-
-        def network(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-            raw, shift = last(hidden(x, share)).chunk(2, -1)  # 2 x (*, D)
-            return LOG_SCALE_BOUND * raw.tanh(), shift
-
-        return network
+        return lambda x, share: last(hidden(x, share))
 
 
 class ConditionalFlow(nn.Module):
@@ -202,7 +196,7 @@ class ConditionalFlow(nn.Module):
             for k, share in enumerate(of_context(context).chunk(len(steps), -1)):  # K x (*, W)
                 x, log_slope = steps[k](mixings[k - 1](x) if k > 0 else x, share)
                 log_slopes.append(log_slope)
-            return x, torch.cat(log_slopes, -1).sum(-1) + constant
+            return x, _total(constant, *log_slopes)
 
         return generate
 
@@ -220,7 +214,7 @@ class ConditionalFlow(nn.Module):
             log_slopes.append(log_slope)
             if k > 0:
                 y = linear(y - lu_layers[k - 1].bias, lu_layers[k - 1].inverse_matrix())
-        return y, torch.cat(log_slopes, -1).sum(-1) + self._constant_log_det()
+        return y, _total(self._constant_log_det(), *log_slopes)
 
     def _layers(self) -> tuple[list[Coupling], list[LULinear]]:
         return (
@@ -231,6 +225,38 @@ class ConditionalFlow(nn.Module):
     def _constant_log_det(self) -> Tensor:
         """Sum the LU layers' log-determinants, a scalar."""
         return sum((layer.log_det() for layer in self._layers()[1]), start=self.context.bias.new_zeros(()))
+
+
+@fused
+def _join(of_x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+    """Add the shares of x and of the context; give the sum and its ReLU."""
+    hidden = of_x + share
+    return hidden, hidden.relu()
+
+
+@fused
+def _move(x: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
+    """Give y and ℓ from x, `(*, D)`, and (u/2, t), `(*, 2 D)`."""
+    log_scale, shift = _log_scale_and_shift(raw)
+    return torch.addcmul(shift, x, log_scale.exp()), log_scale
+
+
+@fused
+def _move_back(y: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
+    """Give x and ℓ from y, likewise."""
+    log_scale, shift = _log_scale_and_shift(raw)
+    return (y - shift) * (-log_scale).exp(), log_scale
+
+
+def _log_scale_and_shift(raw: Tensor) -> tuple[Tensor, Tensor]:
+    half, shift = raw.chunk(2, -1)  # 2 x (*, D)
+    return LOG_SCALE_BOUND * half.tanh(), shift
+
+
+@fused
+def _total(constant: Tensor, *log_slopes: Tensor) -> Tensor:
+    """Add up log|det| from the layers' log-slopes, each `(*, D)`, to `(*)`."""
+    return torch.cat(log_slopes, -1).sum(-1) + constant
 
 
 def bind_now(weight: Tensor, bias: Tensor) -> Affine:

@@ -8,6 +8,7 @@ from torch.nn.functional import softplus
 
 from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.deferred import Loop
+from forbes.fusion import fused
 
 __all__ = ["GaussianBelief", "standard_normal_log_prob"]
 
@@ -35,16 +36,16 @@ class GaussianBelief(BeliefHead):
 
     def moments(self, context: Tensor) -> tuple[Tensor, Tensor]:
         """Give mean and standard deviation, each `(*, D)`."""
-        return self._moments(self.parameters_of(context))
+        return _moments(self.parameters_of(context), self.min_std)
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """See `BeliefHead.rsample`."""
-        return _draw(*self.moments(context), sample_shape)
+        return self._draw(self.parameters_of(context), sample_shape)
 
     def sampler(self, loop: Loop) -> Sampler:
         """See `BeliefHead.sampler`."""
         parameters_of = loop.affine(self.parameters_of.weight, self.parameters_of.bias)
-        return lambda context: _draw(*self._moments(parameters_of(context)))
+        return lambda context: self._draw(parameters_of(context))
 
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
         """See `BeliefHead.log_prob`."""
@@ -62,11 +63,19 @@ class GaussianBelief(BeliefHead):
         ratio, shift = std / prior_std, (mean - prior_mean) / prior_std
         return (0.5 * (ratio.square() + shift.square() - 1) - ratio.log()).sum(-1)
 
-    def _moments(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        mean, raw_std = parameters.chunk(2, -1)  # 2 x (*, D)
-        return mean, softplus(raw_std) + self.min_std
+    def _draw(self, parameters: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+        shape = (*sample_shape, *parameters.shape[:-1], self.state_dim)
+        noise = torch.randn(shape, dtype=parameters.dtype, device=parameters.device)  # (*sample_shape, *, D)
+        return _place(noise, parameters, self.min_std)
 
 
-def _draw(mean: Tensor, std: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-    noise = torch.randn(*sample_shape, *mean.shape, dtype=mean.dtype, device=mean.device)  # (*sample_shape, *, D)
+def _moments(parameters: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
+    mean, raw_std = parameters.chunk(2, -1)  # 2 x (*, D)
+    return mean, softplus(raw_std) + min_std
+
+
+@fused
+def _place(noise: Tensor, parameters: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
+    """Give s, where its noise puts it, and its log-density."""
+    mean, std = _moments(parameters, min_std)
     return torch.addcmul(mean, std, noise), standard_normal_log_prob(noise) - std.log().sum(-1)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.categorical import draw_one_hot, one_hot_of
+from forbes.fusion import fused
 from forbes.models.networks import Perceptron
 
 __all__ = ["Actor", "OneHotCategorical", "Policy", "ScalarHead", "TanhNormal"]
@@ -45,16 +46,29 @@ class TanhNormal:
     def rsample(self, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """Draw a, reparameterised, and log p(a): `(*sample_shape, *, A)` and `(*sample_shape, *)`."""
         noise = torch.randn((*sample_shape, *self.mean.shape), dtype=self.mean.dtype, device=self.mean.device)
-        before = torch.addcmul(self.mean, self.std, noise)  # (*sample_shape, *, A)
-        density = -0.5 * (noise.square() + math.log(2 * math.pi)) - self.std.log()
-        log_prob = (density - 2 * (_LOG_2 - before - softplus(-2 * before))).sum(-1)  # (*sample_shape, *)
-        return before.tanh(), log_prob
+        return _squeeze(noise, self.mean, self.std)
 
     def mode(self) -> Tensor:
         """Give the most probable of 100 samples, each distribution's own, `(*, A)`: there is no closed form."""
         action, log_prob = self.rsample((_MODE_SAMPLES,))
         best = log_prob.argmax(0)  # (*)
         return action.gather(0, best[None, ..., None].expand(1, *action.shape[1:])).squeeze(0)  # (*, A)
+
+
+@fused
+def _squeeze(noise: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
+    """Give the action that noise makes, `(*, A)`, and its log-probability, `(*)`."""
+    before = torch.addcmul(mean, std, noise)  # (*, A)
+    density = -0.5 * (noise.square() + math.log(2 * math.pi)) - std.log()
+    log_prob = (density - 2 * (_LOG_2 - before - softplus(-2 * before))).sum(-1)  # (*)
+    return before.tanh(), log_prob
+
+
+@fused
+def _bounded(numbers: Tensor) -> tuple[Tensor, Tensor]:
+    """Give mean and standard deviation before the tanh, from (x, y)."""
+    mean, std = numbers.chunk(2, -1)  # 2 x (*, A)
+    return 5 * torch.tanh(mean / 5), softplus(std + math.log(math.expm1(5))) + 1e-4
 
 
 class OneHotCategorical:
@@ -103,8 +117,7 @@ class Actor(nn.Module):
         numbers: Tensor = self.head(self.hidden(features))
         if self.discrete:
             return OneHotCategorical(numbers)
-        mean, std = numbers.chunk(2, -1)  # 2 x (*, A)
-        return TanhNormal(5 * torch.tanh(mean / 5), softplus(std + math.log(math.expm1(5))) + 1e-4)
+        return TanhNormal(*_bounded(numbers))
 
 
 class ScalarHead(nn.Module):

@@ -3,9 +3,12 @@
 import torch
 from torch import Tensor
 
+from forbes.fusion import fused
+
 __all__ = ["actor_loss", "critic_loss", "lambda_returns"]
 
 
+@fused
 def lambda_returns(reward: Tensor, value: Tensor, discount: Tensor, lambda_: float) -> Tensor:
     r"""Mix the n-step returns of an imagined trajectory, backwards from its end.
 
@@ -62,6 +65,7 @@ def critic_loss(value: Tensor, returns: Tensor, discount: Tensor, valid: Tensor)
     return _discounted_mean(0.5 * (value - returns.detach()).square(), discount, valid)
 
 
+@fused
 def _discounted_mean(values: Tensor, discount: Tensor, valid: Tensor) -> Tensor:
     """Average over trajectories and states; the first counts 1, each other what the discounts before it leave."""
     first = torch.ones_like(discount[..., :1])

@@ -9,6 +9,7 @@ from torch.distributions import Categorical
 from torch.nn.functional import log_softmax, one_hot, softplus
 
 from forbes.errors import ForbesError
+from forbes.fusion import fused
 
 __all__ = ["Bernoulli", "Likelihood", "Normal", "OneHot", "VectorNormal"]
 
@@ -160,6 +161,7 @@ class OneHot(Likelihood):
         return (target * log_softmax(output, -1)).sum(-1)
 
 
+@fused
 def _normal(mean: Tensor, value: Tensor, std: float, dims: tuple[int, ...]) -> Tensor:
     """Give log N(value; mean, std²) in nats, summed over the last dimensions."""
     constant = math.log(std) + 0.5 * math.log(2 * math.pi)

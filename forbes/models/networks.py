@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from forbes.deferred import Loop
 from forbes.errors import ForbesError
+from forbes.fusion import fused
 
 __all__ = [
     "ConvDecoder",
@@ -60,16 +61,17 @@ def bind_gru(cell: nn.GRUCell, loop: Loop) -> Callable[[Tensor, Tensor], Tensor]
               n = \tanh(W_{in} x + r \odot W_{hn} h), \quad h' = n + z \odot (h - n)
     """
     of_input, of_hidden = loop.affine(cell.weight_ih, cell.bias_ih), loop.affine(cell.weight_hh, cell.bias_hh)
-    sizes = [2 * cell.hidden_size, cell.hidden_size]
+    return lambda x, hidden: _gate(of_input(x), of_hidden(hidden), hidden)
 
-    def step(x: Tensor, hidden: Tensor) -> Tensor:
-        gates_x, new_x = of_input(x).split(sizes, -1)  # (B, 2 H), (B, H)
-        gates_h, new_h = of_hidden(hidden).split(sizes, -1)  # (B, 2 H), (B, H)
-        reset, update = (gates_x + gates_h).sigmoid().chunk(2, -1)  # 2 x (B, H)
-        new = torch.addcmul(new_x, reset, new_h).tanh()
-        return torch.lerp(new, hidden, update)
 
-    return step
+@fused
+def _gate(of_x: Tensor, of_hidden: Tensor, hidden: Tensor) -> Tensor:
+    """Give the next h of a GRU, `(B, H)`, from the shares of x and h, `(B, 3 H)`."""
+    sizes = [2 * hidden.shape[-1], hidden.shape[-1]]
+    gates_x, new_x = of_x.split(sizes, -1)  # (B, 2 H), (B, H)
+    gates_h, new_h = of_hidden.split(sizes, -1)  # (B, 2 H), (B, H)
+    reset, update = (gates_x + gates_h).sigmoid().chunk(2, -1)  # 2 x (B, H)
+    return torch.lerp(torch.addcmul(new_x, reset, new_h).tanh(), hidden, update)
 
 
 class Encoder(nn.Module):

@@ -87,16 +87,14 @@ class ActingModel(WorldModel, ABC):
         terms = self.model.bound(filtered, seen, batch.mask)
         return filtered, terms, -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))
 
-    def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
-        """Give the loss of one update of the world model; logs its parts."""
+    def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """See `WorldModel.losses`: those of the world model."""
         return self.model_loss(*self.explain(batch)[1:])
 
-    def model_loss(self, terms: ElboTerms, reward: Tensor) -> Tensor:
-        """Give the loss of model and reward in nats per step, and log it."""
-        self._log("train", terms)
+    def model_loss(self, terms: ElboTerms, reward: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Give the loss of model and reward in nats per step, and what is logged of it."""
         reward_mean = terms.mean_over_steps(reward)
-        self.log("train/reward", reward_mean.detach())
-        return self.loss(terms) - reward_mean
+        return self.loss(terms) - reward_mean, self.measures(terms) | {"reward": reward_mean.detach()}
 
 
 @dataclass(frozen=True)

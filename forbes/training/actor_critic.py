@@ -98,18 +98,18 @@ class ImaginationActorCritic(ActingModel):
         """See `ActingModel.choose`: a draw with noise, or the mode."""
         return explore(self.actor, self.exploration) if exploring else take_mode(self.actor)
 
-    def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
-        """Give the sum of the three losses of one update; their gradients do not overlap."""
+    def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """See `WorldModel.losses`: the sum of the three, whose gradients do not overlap."""
         filtered, terms, reward = self.explain(batch)
         actor, critic = self.control_losses(filtered, batch.mask & ~batch.ended)
-        self.log_dict({"train/actor_loss": actor.detach(), "train/critic_loss": critic.detach()})
-        loss = self.model_loss(terms, reward) + actor + critic
+        model, values = self.model_loss(terms, reward)
+        values |= {"actor_loss": actor.detach(), "critic_loss": critic.detach()}
+        loss = model + actor + critic
         if self.continues is None:
-            return loss
+            return loss, values
         sign = torch.where(batch.ended, -1.0, 1.0)  # (B, T)
         continuation = terms.mean_over_steps(logsigmoid(sign * self.continues(filtered.features)))
-        self.log("train/continuation", continuation.detach())
-        return loss - continuation
+        return loss - continuation, values | {"continuation": continuation.detach()}
 
     def control_losses(self, filtered: Filtered, begins: Tensor) -> tuple[Tensor, Tensor]:
         """Imagine from beliefs, and give the losses of actor and critic, in units of reward and of its square.

@@ -131,10 +131,18 @@ class WorldModel(LightningModule):
             self.model.center.copy_(self.model.likelihood.target(batch.observation)[batch.mask].mean(0))  # (*O)
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
-        """Give the loss of one update; logs the bound without free nats and its parts, per sequence."""
+        """Give the loss of one update, and log what `losses` gives besides."""
+        loss, values = self.losses(batch)
+        self._log("train", values, batch)
+        return loss
+
+    def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """Give the loss of one update, and what is logged of it: by name, detached.
+
+        It does nothing else, and depends on batch, parameters and noise alone, so that `CudaGraph` can record it.
+        """
         terms = self.terms(batch)
-        self._log("train", terms)
-        return self.loss(terms)
+        return self.loss(terms), self.measures(terms)
 
     def loss(self, terms: ElboTerms) -> Tensor:
         """Give the loss of this update in nats per step, a scalar."""
@@ -149,11 +157,11 @@ class WorldModel(LightningModule):
 
     def validation_step(self, batch: SequenceBatch, batch_idx: int) -> None:
         """Log the bound of the validation split with one sample."""
-        self._log("val", self.terms(batch))
+        self._log("val", self.measures(self.terms(batch)), batch)
 
     def test_step(self, batch: SequenceBatch, batch_idx: int) -> None:
         """Log the bound of the test split with one sample; `forbes evaluate` is the careful way."""
-        self._log("test", self.terms(batch))
+        self._log("test", self.measures(self.terms(batch)), batch)
 
     def predict_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Give the bound of each sequence in nats, `(B,)`, with one sample."""
@@ -190,15 +198,22 @@ class WorldModel(LightningModule):
             norm = torch.nn.utils.clip_grad_norm_(group.parameters, self.clip_norm, foreach=True)
             self.log(f"train/gradient_norm_{group.name}", norm)
 
-    def _log(self, split: str, terms: ElboTerms) -> None:
-        """Log means in nats per sequence, auxiliary losses per step; the bound's name is the model's."""
+    def measures(self, terms: ElboTerms) -> dict[str, Tensor]:
+        """Give means in nats per sequence, auxiliary losses per step: the bound without free nats, and its parts."""
         parts = {
             "reconstruction": (terms.reconstruction * terms.mask).sum(1).mean(),
             "kl": (terms.kl * terms.mask).sum(1).mean(),
             **terms.auxiliary,
         }
         values = {self.objective_name: terms.elbo.mean()} | {name: parts[name] for name in self.model.parts}
-        self.log_dict({f"{split}/{name}": value.detach() for name, value in values.items()}, batch_size=len(terms.mask))
+        return {name: value.detach() for name, value in values.items()}
+
+    def _log(self, split: str, values: dict[str, Tensor], batch: SequenceBatch) -> None:
+        self.log_dict({f"{split}/{name}": value for name, value in values.items()}, batch_size=len(batch.mask))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what `CudaGraph` has put in the place of `losses`: it belongs to one process."""
+        return {name: value for name, value in super().__getstate__().items() if name != "losses"}
 
 
 def follow_rates(module: LightningModule, rates: Sequence[float]) -> None:

@@ -2,6 +2,7 @@
 
 from forbes.training.callbacks.belief_plot import BeliefPlot
 from forbes.training.callbacks.collect import Collect
+from forbes.training.callbacks.cuda_graph import CudaGraph
 from forbes.training.callbacks.elbo_curve import ElboCurve
 from forbes.training.callbacks.episode_video import EpisodeVideo
 from forbes.training.callbacks.imagined_futures import ImaginedFutures
@@ -11,5 +12,5 @@ from forbes.training.callbacks.picture import PictureCallback
 from forbes.training.callbacks.prediction_grid import PredictionGrid
 from forbes.training.callbacks.return_curve import ReturnCurve
 
-__all__ = ["BeliefPlot", "Collect", "ElboCurve", "EpisodeVideo", "ImaginedFutures", "OpenLoopPanel", "ParameterCount"]
-__all__ += ["PictureCallback", "PredictionGrid", "ReturnCurve"]
+__all__ = ["BeliefPlot", "Collect", "CudaGraph", "ElboCurve", "EpisodeVideo", "ImaginedFutures", "OpenLoopPanel"]
+__all__ += ["ParameterCount", "PictureCallback", "PredictionGrid", "ReturnCurve"]
