@@ -114,7 +114,7 @@ class Work:
             self.filtered = self.agent.model.filter(seen.embedding, seen.action)
         self.losses = self.agent.losses
         if device.type == "cuda":
-            self.losses = record(self.agent, self.batch, self.precision())
+            self.losses = record(self.agent, self.batch, self.precision)
 
     def loading(self) -> SequenceBatch:
         """Draw a batch of windows from the store, and put it on the device."""

@@ -10,18 +10,31 @@ as one product over (T·B). Same numbers up to the order of a sum; `benchmarks/R
 """
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import linear
 
-__all__ = ["Affine", "Bind", "Loop"]
+from forbes.fusion import Elementwise, after_affine, keep
 
-Affine: TypeAlias = Callable[[Tensor], Tensor]
-"""x `(*, in)` to W x + b `(*, out)`."""
-Bind: TypeAlias = Callable[[Tensor, Tensor], Affine]
-"""Fixes W `(out, in)` and b `(out,)`."""
+__all__ = ["Affine", "Bind", "Loop", "bind_now"]
+
+Affine: TypeAlias = Callable[..., Any]
+"""x `(*, in)` and what else `then` takes, to then(W x + b, ...); W x + b is `(*, out)`."""
+
+
+class Bind(Protocol):
+    """Fixes W `(out, in)` and b `(out,)` of an affine map, and what elementwise function follows it."""
+
+    def __call__(self, weight: Tensor, bias: Tensor, then: Elementwise = keep) -> Affine:
+        """Bind."""
+
+
+def bind_now(weight: Tensor, bias: Tensor, then: Elementwise = keep) -> Affine:
+    """Bind outside a time loop."""
+    return lambda x, *more: then(linear(x, weight, bias), *more)
 
 
 class Loop:
@@ -30,21 +43,21 @@ class Loop:
     def __init__(self, steps: int, batch: int) -> None:
         self.steps, self.batch = steps, batch
 
-    def affine(self, weight: Tensor, bias: Tensor) -> Affine:
-        """Bind W `(out, in)` and b, `(out,)` or one per step `(T, B, out)`, to a map that is called once a step."""
+    def affine(self, weight: Tensor, bias: Tensor, then: Elementwise = keep) -> Affine:
+        """See `Bind`: a map that is called once a step; b may also be one per step, `(T, B, out)`."""
         shares = bias.expand(self.steps, self.batch, -1)  # (T, B, out)
         learns = torch.is_grad_enabled() and (weight.requires_grad or bias.requires_grad)
         if not learns or torch.compiler.is_compiling():
             # Nothing to defer, or the compiler orders the products itself.
             share, transposed = iter(shares.unbind(0)), weight.T  # (in, out)
-            return lambda x: torch.addmm(next(share), x, transposed)
+            return lambda x, *more: after_affine(then, next(share), x, transposed, *more)
         inputs: list[Tensor] = []
         share = iter(_Shares.apply(weight, shares, inputs).unbind(0))  # type: ignore[no-untyped-call]
         matrix = weight.detach().T  # (in, out)
 
-        def affine(x: Tensor) -> Tensor:
+        def affine(x: Tensor, *more: Any) -> Any:
             inputs.append(x.detach())
-            return torch.addmm(next(share), x, matrix)
+            return after_affine(then, next(share), x, matrix, *more)
 
         return affine
 

@@ -9,14 +9,18 @@ on a CPU.
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import torch
+from torch import Tensor
 
-__all__ = ["fused", "fusing"]
+__all__ = ["Elementwise", "after_affine", "fused", "fusing", "keep", "side_by_side"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+S = TypeVar("S")
+Elementwise: TypeAlias = Callable[..., Any]
+"""A function of a tensor, and of whatever else; a function of a module, so that it is compiled once."""
 
 _on = False
 
@@ -27,7 +31,7 @@ def fusing() -> Iterator[None]:
     global _on
     before, _on = _on, True
     try:
-        with torch._dynamo.config.patch(recompile_limit=64):  # a function meets more shapes than the usual 8
+        with torch._dynamo.config.patch(recompile_limit=256):  # a function meets more shapes than the usual 8
             yield
     finally:
         _on = before
@@ -41,6 +45,59 @@ def fused(function: Callable[P, R]) -> Callable[P, R]:
         return (_compiled(function) if _on else function)(*args, **kwargs)
 
     return either
+
+
+def keep(x: Tensor) -> Tensor:
+    """Give x: nothing follows."""
+    return x
+
+
+def after_affine(then: Elementwise, share: Tensor, x: Tensor, matrix: Tensor, *more: Any) -> Any:
+    """Give then(x W + b, ...), with b as `(B, out)`.
+
+    Under `fusing`, adding b is part of what follows: `addmm` would copy it first, a kernel as long as the product.
+    """
+    if not _on or then is keep:
+        return then(torch.addmm(share, x, matrix), *more)
+    return _compiled(_after_sum(then))(x @ matrix, share, *more)
+
+
+def side_by_side(first: Callable[[], R], second: Callable[[], S], *shared: Tensor) -> tuple[R, S]:
+    """Do two things that do not depend on each other.
+
+    Under `fusing`, a GPU does both at the same time, gradients too: alone, each is too small to fill it.
+
+    Args:
+        first: of them.
+        second: likewise.
+        shared: what the second reads and others have made.
+    """
+    if not (_on and shared[0].is_cuda):
+        return first(), second()
+    here, beside = torch.cuda.current_stream(), _second_stream()
+    beside.wait_stream(here)
+    for tensor in shared:
+        tensor.record_stream(beside)  # its memory is not free before the second has read it
+    done = first()
+    with torch.cuda.stream(beside):
+        also = second()
+    here.wait_stream(beside)
+    return done, also
+
+
+@cache
+def _second_stream() -> torch.cuda.Stream:
+    return torch.cuda.Stream()
+
+
+@cache
+def _after_sum(then: Elementwise) -> Elementwise:
+    inner = getattr(then, "__wrapped__", then)  # of a `fused` function, itself
+
+    def after_sum(product: Tensor, share: Tensor, *more: Any) -> Any:
+        return inner(product + share, *more)
+
+    return after_sum
 
 
 @cache

@@ -7,17 +7,17 @@ other evaluates (`inverse`); both cost the same.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, pad, softplus
 
-from forbes.deferred import Affine, Bind
+from forbes.deferred import Bind, bind_now
 from forbes.errors import ForbesError
-from forbes.fusion import fused
+from forbes.fusion import Elementwise, fused, keep
 
-__all__ = ["AffineCoupling", "ConditionalFlow", "Coupling", "CouplingFamily", "FlowMap", "LULinear", "bind_now"]
+__all__ = ["AffineCoupling", "ConditionalFlow", "Coupling", "CouplingFamily", "FlowMap", "LULinear"]
 
 LOG_SCALE_BOUND = 2.0
 """|ℓ| stays below this in each layer: a plain exp explodes (nflows issue 49), a sigmoid could only contract."""
@@ -87,25 +87,50 @@ class Coupling(nn.Module, ABC):
         self.inner, self.outer = nn.Linear(width, width), nn.Linear(width, width)
 
     @abstractmethod
-    def generator(self, bind: Bind) -> FlowMap:
-        """Prepare (x, share) -> (y, log-slopes): `(*, D)` and `(*, W)` to `(*, D)` and what sums to log|det ∂y/∂x|."""
+    def generator(self, bind: Bind, mixing: LULinear | None = None) -> FlowMap:
+        """Prepare (x, share) -> (y, log-slopes): `(*, D)` and `(*, W)` to `(*, D)` and what sums to log|det ∂y/∂x|.
+
+        With `mixing`, y is of the x that this layer makes first.
+        """
 
     @abstractmethod
     def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
         """Give x, `(*, D)`, and the forward log-slopes at it."""
 
-    def hidden(self, bind: Bind) -> Callable[[Tensor, Tensor], Tensor]:
-        """Prepare the network but for its last layer: (x, share) to `(*, W)`."""
-        inner, outer = bind(self.inner.weight, self.inner.bias), bind(self.outer.weight, self.outer.bias)
+    def network(
+        self, bind: Bind, weight: Tensor, bias: Tensor, then: Elementwise, mixing: LULinear | None = None, *more: Any
+    ) -> FlowMap:
+        r"""Prepare (x, share) -> then(NN, x, ...), where NN ends in the layer with this weight and bias.
 
-        def block(hidden: Tensor, active: Tensor) -> Tensor:
-            return hidden + outer(inner(active).relu())
+        Layers with nothing elementwise between them are one product each time: what mixes x and the first layer, and
+        the block's second layer O, added to its input u, and the last layer L:
 
+        .. math:: L (u + O v) = [L, L O]\,[u, v]
+        """
+        enter = self._entrance(bind, mixing)
+        inner = bind(self.inner.weight, self.inner.bias, _extend)
+        both = torch.cat((weight, weight @ self.outer.weight), 1)  # (out, 2 W)
+        last = bind(both, bias + weight @ self.outer.bias, then)
+
+        def run(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+            x, hidden, active = enter(x, share)
+            moved: tuple[Tensor, Tensor] = last(inner(active, hidden), x, *more)
+            return moved
+
+        return run
+
+    def _entrance(self, bind: Bind, mixing: LULinear | None) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:
+        """Prepare (x, share) -> x, mixed, the first layer's output, and its ReLU: `(*, D)`, `(*, W)`, `(*, W)`."""
         if self.first is None:
-            return lambda x, share: block(share, share.relu())
+            mix = bind(mixing.matrix(), mixing.bias) if mixing else keep
+            return lambda x, share: (mix(x), share, share.relu())
         weight = pad(self.first.weight, (self.other, 0) if self.swap else (0, self.other))  # (W, D)
-        first = bind(weight, weight.new_zeros(len(weight)))
-        return lambda x, share: block(*_join(first(x), share))
+        if mixing is None:
+            first = bind(weight, weight.new_zeros(len(weight)), _join)
+            return lambda x, share: (x, *first(x, share))
+        matrix = mixing.matrix()
+        rows = torch.cat((matrix, weight @ matrix))  # (D + W, D)
+        return bind(rows, torch.cat((mixing.bias, weight @ mixing.bias)), _split_and_join)
 
 
 class AffineCoupling(Coupling):
@@ -132,27 +157,21 @@ class AffineCoupling(Coupling):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
-    def generator(self, bind: Bind) -> FlowMap:
+    def generator(self, bind: Bind, mixing: LULinear | None = None) -> FlowMap:
         """See `Coupling.generator`; the log-slopes are `(*, D)`."""
-        network = self._network(bind)
-
-        def generate(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-            return _move(x, network(x, share))
-
-        return generate
+        return self.network(bind, *self._last(), _move, mixing)
 
     def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
         """See `Coupling.inverse`."""
-        return _move_back(y, self._network(bind_now)(y, share))
+        return self.network(bind_now, *self._last(), _move_back)(y, share)
 
-    def _network(self, bind: Bind) -> Callable[[Tensor, Tensor], Tensor]:
-        """Prepare (x, share) -> (u/2, t): shapes `(*, D)` and `(*, W)` to `(*, 2 D)`, zeros for x_a."""
-        hidden, around = self.hidden(bind), (0, self.given) if self.swap else (self.given, 0)
+    def _last(self) -> tuple[Tensor, Tensor]:
+        """Give weight and bias of the layer that writes (u/2, t), zeros for x_a: `(2 D, W)` and `(2 D,)`."""
+        around = (0, self.given) if self.swap else (self.given, 0)
         rows = (0, 0, *around)
         weight = torch.cat((pad(self.log_scale.weight / LOG_SCALE_BOUND, rows), pad(self.shift.weight, rows)))
         bias = torch.cat((pad(self.log_scale.bias / LOG_SCALE_BOUND, around), pad(self.shift.bias, around)))
-        last = bind(weight, bias)  # (2 D, W), (2 D,)
-        return lambda x, share: last(hidden(x, share))
+        return weight, bias
 
 
 class ConditionalFlow(nn.Module):
@@ -187,14 +206,15 @@ class ConditionalFlow(nn.Module):
         """
         of_context = bind(self.context.weight, self.context.bias)
         couplings, lu_layers = self._layers()
-        steps = [coupling.generator(bind) for coupling in couplings]
-        mixings = [bind(layer.matrix(), layer.bias) for layer in lu_layers]
+        steps = [
+            coupling.generator(bind, mixing) for coupling, mixing in zip(couplings, [None, *lu_layers], strict=True)
+        ]
         constant = self._constant_log_det()
 
         def generate(x: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
             log_slopes = []
-            for k, share in enumerate(of_context(context).chunk(len(steps), -1)):  # K x (*, W)
-                x, log_slope = steps[k](mixings[k - 1](x) if k > 0 else x, share)
+            for step, share in zip(steps, of_context(context).chunk(len(steps), -1), strict=True):  # K x (*, W)
+                x, log_slope = step(x, share)
                 log_slopes.append(log_slope)
             return x, _total(constant, *log_slopes)
 
@@ -235,14 +255,29 @@ def _join(of_x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @fused
-def _move(x: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
-    """Give y and ℓ from x, `(*, D)`, and (u/2, t), `(*, 2 D)`."""
+def _split_and_join(both: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Give x from what is x and its share, `(*, D + W)`, then as `_join`."""
+    width = share.shape[-1]
+    x, of_x = both.split((both.shape[-1] - width, width), -1)  # (*, D), (*, W)
+    hidden = of_x + share
+    return x, hidden, hidden.relu()
+
+
+@fused
+def _extend(inner: Tensor, hidden: Tensor) -> Tensor:
+    """Give the block's input and what its second layer reads, side by side, `(*, 2 W)`."""
+    return torch.cat((hidden, inner.relu()), -1)
+
+
+@fused
+def _move(raw: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Give y and ℓ from (u/2, t), `(*, 2 D)`, and x, `(*, D)`."""
     log_scale, shift = _log_scale_and_shift(raw)
     return torch.addcmul(shift, x, log_scale.exp()), log_scale
 
 
 @fused
-def _move_back(y: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
+def _move_back(raw: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Give x and ℓ from y, likewise."""
     log_scale, shift = _log_scale_and_shift(raw)
     return (y - shift) * (-log_scale).exp(), log_scale
@@ -257,8 +292,3 @@ def _log_scale_and_shift(raw: Tensor) -> tuple[Tensor, Tensor]:
 def _total(constant: Tensor, *log_slopes: Tensor) -> Tensor:
     """Add up log|det| from the layers' log-slopes, each `(*, D)`, to `(*)`."""
     return torch.cat(log_slopes, -1).sum(-1) + constant
-
-
-def bind_now(weight: Tensor, bias: Tensor) -> Affine:
-    """Bind outside a time loop."""
-    return lambda x: linear(x, weight, bias)

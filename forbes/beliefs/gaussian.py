@@ -40,12 +40,12 @@ class GaussianBelief(BeliefHead):
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """See `BeliefHead.rsample`."""
-        return self._draw(self.parameters_of(context), sample_shape)
+        return _place(self.parameters_of(context), self._noise(context, sample_shape), self.min_std)
 
     def sampler(self, loop: Loop) -> Sampler:
         """See `BeliefHead.sampler`."""
-        parameters_of = loop.affine(self.parameters_of.weight, self.parameters_of.bias)
-        return lambda context: self._draw(parameters_of(context))
+        place = loop.affine(self.parameters_of.weight, self.parameters_of.bias, _place)
+        return lambda context: place(context, self._noise(context), self.min_std)
 
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
         """See `BeliefHead.log_prob`."""
@@ -63,10 +63,9 @@ class GaussianBelief(BeliefHead):
         ratio, shift = std / prior_std, (mean - prior_mean) / prior_std
         return (0.5 * (ratio.square() + shift.square() - 1) - ratio.log()).sum(-1)
 
-    def _draw(self, parameters: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-        shape = (*sample_shape, *parameters.shape[:-1], self.state_dim)
-        noise = torch.randn(shape, dtype=parameters.dtype, device=parameters.device)  # (*sample_shape, *, D)
-        return _place(noise, parameters, self.min_std)
+    def _noise(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> Tensor:
+        shape = (*sample_shape, *context.shape[:-1], self.state_dim)
+        return torch.randn(*shape, dtype=context.dtype, device=context.device)  # (*sample_shape, *, D)
 
 
 def _moments(parameters: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
@@ -75,7 +74,7 @@ def _moments(parameters: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
 
 
 @fused
-def _place(noise: Tensor, parameters: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
+def _place(parameters: Tensor, noise: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
     """Give s, where its noise puts it, and its log-density."""
     mean, std = _moments(parameters, min_std)
     return torch.addcmul(mean, std, noise), standard_normal_log_prob(noise) - std.log().sum(-1)

@@ -4,15 +4,14 @@ An increasing map of the box [-5, 5] to itself through K + 1 knots, the identity
 it splits one mode into several, even of a one-dimensional state.
 """
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from forbes.beliefs.flows import Coupling, FlowMap, bind_now
-from forbes.deferred import Bind
+from forbes.beliefs.flows import Coupling, FlowMap, LULinear
+from forbes.deferred import Bind, bind_now
 from forbes.errors import ForbesError
+from forbes.fusion import fused
 
 __all__ = ["SplineCoupling", "knot_table", "spline", "spline_inverse"]
 
@@ -131,23 +130,32 @@ class SplineCoupling(Coupling):
         nn.init.zeros_(self.knots.weight)
         nn.init.zeros_(self.knots.bias)
 
-    def generator(self, bind: Bind) -> FlowMap:
+    def generator(self, bind: Bind, mixing: LULinear | None = None) -> FlowMap:
         """See `Coupling.generator`; the log-slopes are those of x_b."""
-        tables = self._tables(bind)
-        return lambda x, share: self._move(spline, x, tables(x, share))
+        return self.network(bind, self.knots.weight, self.knots.bias, _move, mixing, self.given, self.swap)
 
     def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
         """See `Coupling.inverse`."""
-        return self._move(spline_inverse, y, self._tables(bind_now)(y, share))
+        knots = self.knots.weight, self.knots.bias
+        return self.network(bind_now, *knots, _move_back, None, self.given, self.swap)(y, share)
 
-    def _tables(self, bind: Bind) -> Callable[[Tensor, Tensor], Tensor]:
-        """Prepare (x, share) -> the bins of x_b's splines: shapes `(*, D)` and `(*, W)` to `(*, other, 6, K)`."""
-        hidden, last = self.hidden(bind), bind(self.knots.weight, self.knots.bias)
-        return lambda x, share: knot_table(last(hidden(x, share)).unflatten(-1, (self.other, -1)))
 
-    def _move(self, by: FlowMap, x: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
-        """Move x_b by a spline or its inverse."""
-        before, after = x.split((self.other, self.given) if self.swap else (self.given, self.other), -1)
-        moved, log_slope = by(before if self.swap else after, table)  # (*, other), (*, other)
-        kept = (after if self.swap else before).expand(*moved.shape[:-1], -1)  # (*, given)
-        return torch.cat((moved, kept) if self.swap else (kept, moved), -1), log_slope  # (*, D), (*, other)
+@fused
+def _move(raw: Tensor, x: Tensor, given: int, swap: bool) -> tuple[Tensor, Tensor]:
+    """Move x_b by splines of raw numbers, `(*, other (3 K - 1))`; give y, `(*, D)`, and the log-slopes of x_b."""
+    return _move_by(spline, raw, x, given, swap)
+
+
+@fused
+def _move_back(raw: Tensor, y: Tensor, given: int, swap: bool) -> tuple[Tensor, Tensor]:
+    """Move y_b back, likewise."""
+    return _move_by(spline_inverse, raw, y, given, swap)
+
+
+def _move_by(by: FlowMap, raw: Tensor, x: Tensor, given: int, swap: bool) -> tuple[Tensor, Tensor]:
+    other = x.shape[-1] - given
+    table = knot_table(raw.unflatten(-1, (other, -1)))  # (*, other, 6, K)
+    before, after = x.split((other, given) if swap else (given, other), -1)
+    moved, log_slope = by(before if swap else after, table)  # (*, other), (*, other)
+    kept = (after if swap else before).expand(*moved.shape[:-1], -1)  # (*, given)
+    return torch.cat((moved, kept) if swap else (kept, moved), -1), log_slope  # (*, D), (*, other)

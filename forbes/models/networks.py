@@ -7,10 +7,11 @@ from typing import ClassVar, Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import elu, relu
 
 from forbes.deferred import Loop
 from forbes.errors import ForbesError
-from forbes.fusion import fused
+from forbes.fusion import Elementwise, fused
 
 __all__ = [
     "ConvDecoder",
@@ -26,6 +27,7 @@ __all__ = [
 
 Activation: TypeAlias = Literal["relu", "elu"]
 _ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU}
+_FUNCTIONS: dict[type[nn.Module], Elementwise] = {nn.ReLU: relu, nn.ELU: elu}
 
 
 class Perceptron(nn.Sequential):
@@ -41,9 +43,9 @@ class Perceptron(nn.Sequential):
         return [layer for layer in self.modules() if isinstance(layer, nn.Linear)]
 
     @property
-    def activation(self) -> nn.Module:
+    def activation(self) -> Elementwise:
         """What follows each of them."""
-        return self.get_submodule("0.1")
+        return _FUNCTIONS[type(self.get_submodule("0.1"))]
 
 
 def activate(module: nn.Module, activation: Activation) -> None:
@@ -60,13 +62,14 @@ def bind_gru(cell: nn.GRUCell, loop: Loop) -> Callable[[Tensor, Tensor], Tensor]
     .. math:: r, z = \sigma(W_{ir} x + W_{hr} h), \sigma(W_{iz} x + W_{hz} h), \quad
               n = \tanh(W_{in} x + r \odot W_{hn} h), \quad h' = n + z \odot (h - n)
     """
-    of_input, of_hidden = loop.affine(cell.weight_ih, cell.bias_ih), loop.affine(cell.weight_hh, cell.bias_hh)
-    return lambda x, hidden: _gate(of_input(x), of_hidden(hidden), hidden)
+    of_input = loop.affine(cell.weight_ih, cell.bias_ih)
+    of_hidden = loop.affine(cell.weight_hh, cell.bias_hh, _gate)
+    return lambda x, hidden: of_hidden(hidden, of_input(x), hidden)
 
 
 @fused
-def _gate(of_x: Tensor, of_hidden: Tensor, hidden: Tensor) -> Tensor:
-    """Give the next h of a GRU, `(B, H)`, from the shares of x and h, `(B, 3 H)`."""
+def _gate(of_hidden: Tensor, of_x: Tensor, hidden: Tensor) -> Tensor:
+    """Give the next h of a GRU, `(B, H)`, from the shares of h and x, `(B, 3 H)`."""
     sizes = [2 * hidden.shape[-1], hidden.shape[-1]]
     gates_x, new_x = of_x.split(sizes, -1)  # (B, 2 H), (B, H)
     gates_h, new_h = of_hidden.split(sizes, -1)  # (B, 2 H), (B, H)

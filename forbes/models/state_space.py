@@ -219,13 +219,12 @@ class StateSpaceModel(BeliefModel):
         of_loop, of_known = first.weight[:, :cut], first.weight[:, cut:]  # (M, cut), (M, K)
         share = linear(known.transpose(0, 1), of_known, first.bias)  # (T, B, M)
         copies = share[:, None].expand(-1, loop.batch // len(known), -1, -1).flatten(1, 2)  # (T, N B, M)
-        layers = [loop.affine(of_loop, copies)]
-        layers += [loop.affine(layer.weight, layer.bias) for layer in others]
-        activation = network.activation
+        layers = [loop.affine(of_loop, copies, network.activation)]
+        layers += [loop.affine(layer.weight, layer.bias, network.activation) for layer in others]
 
         def run(x: Tensor) -> Tensor:
             for layer in layers:
-                x = activation(layer(x))
+                x = layer(x)
             return x
 
         return run

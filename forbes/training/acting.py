@@ -15,7 +15,7 @@ from forbes.data.collection import episode_seed, play_whole
 from forbes.data.episodes import Episode
 from forbes.envs import Environment
 from forbes.errors import ForbesError
-from forbes.models import Filtered, StateSpaceModel
+from forbes.models import Filtered, Seen, StateSpaceModel
 from forbes.models.elbo import ElboTerms
 from forbes.models.networks import activate
 from forbes.training.world_model import WorldModel, require_at_least
@@ -81,11 +81,19 @@ class ActingModel(WorldModel, ABC):
 
     def explain(self, batch: SequenceBatch) -> tuple[Filtered, ElboTerms, Tensor]:
         """Filter a batch; give the trajectory, the parts of the bound, and log p(r_t | f_t) in nats, `(B, T)`."""
+        seen, filtered = self.follow(batch)
+        return filtered, *self.judge(filtered, seen, batch)
+
+    def follow(self, batch: SequenceBatch) -> tuple[Seen, Filtered]:
+        """Encode a batch, and draw a trajectory of the posterior along it."""
         seen = self.model.see(batch.observation, batch.action)
-        filtered = self.model.filter(seen.embedding, seen.action)
+        return seen, self.model.filter(seen.embedding, seen.action)
+
+    def judge(self, filtered: Filtered, seen: Seen, batch: SequenceBatch) -> tuple[ElboTerms, Tensor]:
+        """Give the parts of the bound, and log p(r_t | f_t) in nats, `(B, T)`, along a trajectory."""
         error = (self.reward(filtered.features) - batch.reward) / self.reward_std  # (B, T)
         terms = self.model.bound(filtered, seen, batch.mask)
-        return filtered, terms, -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))
+        return terms, -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))
 
     def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """See `WorldModel.losses`: those of the world model."""

@@ -11,6 +11,7 @@ from forbes.control.imagination import belief_samples, frozen
 from forbes.control.policy import Actor, Policy, ScalarHead
 from forbes.control.returns import actor_loss, critic_loss, lambda_returns
 from forbes.data import SequenceBatch
+from forbes.fusion import side_by_side
 from forbes.models import Filtered, State
 from forbes.models.networks import activate
 from forbes.training.acting import ActingModel
@@ -100,8 +101,11 @@ class ImaginationActorCritic(ActingModel):
 
     def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """See `WorldModel.losses`: the sum of the three, whose gradients do not overlap."""
-        filtered, terms, reward = self.explain(batch)
-        actor, critic = self.control_losses(filtered, batch.mask & ~batch.ended)
+        seen, filtered = self.follow(batch)
+        begins = batch.mask & ~batch.ended  # (B, T)
+        (terms, reward), (actor, critic) = side_by_side(
+            lambda: self.judge(filtered, seen, batch), lambda: self.control_losses(filtered, begins), *filtered, begins
+        )
         model, values = self.model_loss(terms, reward)
         values |= {"actor_loss": actor.detach(), "critic_loss": critic.detach()}
         loss = model + actor + critic

@@ -39,7 +39,7 @@ class CudaGraph(Callback):
     ) -> None:
         """Record; the module seeds the noise of its update after this."""
         if isinstance(pl_module, WorldModel) and batch.mask.is_cuda and "losses" not in vars(pl_module):
-            vars(pl_module)["losses"] = record(pl_module, batch, trainer.precision_plugin.forward_context())
+            vars(pl_module)["losses"] = record(pl_module, batch, trainer.precision_plugin.forward_context)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Give the module its own losses back."""
@@ -47,18 +47,18 @@ class CudaGraph(Callback):
 
 
 def record(
-    module: WorldModel, batch: SequenceBatch, precision: AbstractContextManager[Any]
+    module: WorldModel, batch: SequenceBatch, precision: Callable[[], AbstractContextManager[Any]]
 ) -> Callable[[SequenceBatch], tuple[Tensor, dict[str, Tensor]]]:
     """Record the losses of a module on a GPU, with their gradients, for batches of the same shapes.
 
     Args:
         module: in training mode; its parameters may change their values, not their memory.
         batch: any.
-        precision: the mixed precision of the training.
+        precision: gives the context of the training's mixed precision.
     """
-    with precision, fusing():
+    with fusing():
         recorded: Callable[..., Any] = torch.cuda.make_graphed_callables(
-            _Losses(module), tuple(values.clone() for values in batch), allow_unused_input=True
+            _Losses(module, precision), tuple(values.clone() for values in batch), allow_unused_input=True
         )
     return lambda batch: recorded(*batch)
 
@@ -66,9 +66,10 @@ def record(
 class _Losses(nn.Module):
     """The losses of a module as what can be recorded: a function of tensors, which has its parameters."""
 
-    def __init__(self, module: WorldModel) -> None:
+    def __init__(self, module: WorldModel, precision: Callable[[], AbstractContextManager[Any]]) -> None:
         super().__init__()
-        self.module = module
+        self.module, self.precision = module, precision
 
     def forward(self, *values: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        return self.module.losses(SequenceBatch(*values))
+        with self.precision():  # the gradients' kernels take theirs from the tensors
+            return self.module.losses(SequenceBatch(*values))
