@@ -34,7 +34,7 @@ from forbes.envs import Environment, Step, find_environment
 from forbes.errors import ForbesError
 from forbes.models import MLPDecoder, MLPEncoder, VectorNormal
 from forbes.training import ImaginationActorCritic
-from forbes.training.callbacks.cuda_graph import record
+from forbes.training.callbacks.cuda_graph import Recording
 
 PARTS = ("loading", "model", "imagination", "update", "recorded", "acting")
 EPISODES = 10
@@ -110,11 +110,10 @@ class Work:
         self.acting = Agent(self.agent.model, self.agent.choose(exploring=True), seed=0)
         self.batch = self.loading()
         with torch.no_grad():
-            seen = self.agent.model.see(self.batch.observation, self.batch.action)
-            self.filtered = self.agent.model.filter(seen.embedding, seen.action)
-        self.losses = self.agent.losses
+            _, self.filtered = self.agent.follow(self.batch)
+        self.losses: Callable[[SequenceBatch], tuple[Tensor, Any]] = self.agent.losses
         if device.type == "cuda":
-            self.losses = record(self.agent, self.batch, self.precision)
+            self.losses = Recording(self.agent, self.batch, self.precision)
 
     def loading(self) -> SequenceBatch:
         """Draw a batch of windows from the store, and put it on the device."""
@@ -129,8 +128,8 @@ class Work:
     def model(self) -> None:
         """Form the gradients of world model and reward."""
         with self.precision():
-            _, terms, reward = self.agent.explain(self.batch)
-            loss, _ = self.agent.model_loss(terms, reward)
+            seen, filtered = self.agent.follow(self.batch)
+            loss, _ = self.agent.model_objective(filtered, seen, self.batch)
         self._backward(loss)
 
     def imagination(self) -> None:

@@ -14,11 +14,10 @@ from typing import Any, ParamSpec, TypeAlias, TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["Elementwise", "after_affine", "fused", "fusing", "keep", "side_by_side"]
+__all__ = ["Elementwise", "after_affine", "fused", "fusing", "keep"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
-S = TypeVar("S")
 Elementwise: TypeAlias = Callable[..., Any]
 """A function of a tensor, and of whatever else; a function of a module, so that it is compiled once."""
 
@@ -60,34 +59,6 @@ def after_affine(then: Elementwise, share: Tensor, x: Tensor, matrix: Tensor, *m
     if not _on or then is keep:
         return then(torch.addmm(share, x, matrix), *more)
     return _compiled(_after_sum(then))(x @ matrix, share, *more)
-
-
-def side_by_side(first: Callable[[], R], second: Callable[[], S], *shared: Tensor) -> tuple[R, S]:
-    """Do two things that do not depend on each other.
-
-    Under `fusing`, a GPU does both at the same time, gradients too: alone, each is too small to fill it.
-
-    Args:
-        first: of them.
-        second: likewise.
-        shared: what the second reads and others have made.
-    """
-    if not (_on and shared[0].is_cuda):
-        return first(), second()
-    here, beside = torch.cuda.current_stream(), _second_stream()
-    beside.wait_stream(here)
-    for tensor in shared:
-        tensor.record_stream(beside)  # its memory is not free before the second has read it
-    done = first()
-    with torch.cuda.stream(beside):
-        also = second()
-    here.wait_stream(beside)
-    return done, also
-
-
-@cache
-def _second_stream() -> torch.cuda.Stream:
-    return torch.cuda.Stream()
 
 
 @cache

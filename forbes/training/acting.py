@@ -16,9 +16,8 @@ from forbes.data.episodes import Episode
 from forbes.envs import Environment
 from forbes.errors import ForbesError
 from forbes.models import Filtered, Seen, StateSpaceModel
-from forbes.models.elbo import ElboTerms
 from forbes.models.networks import activate
-from forbes.training.world_model import WorldModel, require_at_least
+from forbes.training.world_model import Objective, WorldModel, require_at_least
 
 __all__ = ["Acting", "ActingModel", "play_measured"]
 
@@ -79,30 +78,26 @@ class ActingModel(WorldModel, ABC):
     def choose(self, exploring: bool) -> Choice:
         """Give how to act: with exploration, to learn from it, or as well as the agent can."""
 
-    def explain(self, batch: SequenceBatch) -> tuple[Filtered, ElboTerms, Tensor]:
-        """Filter a batch; give the trajectory, the parts of the bound, and log p(r_t | f_t) in nats, `(B, T)`."""
+    def objectives(self, batch: SequenceBatch) -> list[Objective]:
+        """See `WorldModel.objectives`: that of the world model."""
         seen, filtered = self.follow(batch)
-        return filtered, *self.judge(filtered, seen, batch)
+        return [lambda: self.model_objective(filtered, seen, batch)]
 
     def follow(self, batch: SequenceBatch) -> tuple[Seen, Filtered]:
         """Encode a batch, and draw a trajectory of the posterior along it."""
         seen = self.model.see(batch.observation, batch.action)
         return seen, self.model.filter(seen.embedding, seen.action)
 
-    def judge(self, filtered: Filtered, seen: Seen, batch: SequenceBatch) -> tuple[ElboTerms, Tensor]:
-        """Give the parts of the bound, and log p(r_t | f_t) in nats, `(B, T)`, along a trajectory."""
-        error = (self.reward(filtered.features) - batch.reward) / self.reward_std  # (B, T)
+    def model_objective(self, filtered: Filtered, seen: Seen, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """Give the loss of model and reward in nats per step, and what is logged of it, along a trajectory."""
         terms = self.model.bound(filtered, seen, batch.mask)
-        return terms, -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))
+        reward = terms.mean_over_steps(self.reward_log_prob(filtered, batch))
+        return self.loss(terms) - reward, self.measures(terms) | {"reward": reward.detach()}
 
-    def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """See `WorldModel.losses`: those of the world model."""
-        return self.model_loss(*self.explain(batch)[1:])
-
-    def model_loss(self, terms: ElboTerms, reward: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Give the loss of model and reward in nats per step, and what is logged of it."""
-        reward_mean = terms.mean_over_steps(reward)
-        return self.loss(terms) - reward_mean, self.measures(terms) | {"reward": reward_mean.detach()}
+    def reward_log_prob(self, filtered: Filtered, batch: SequenceBatch) -> Tensor:
+        """Give log p(r_t | f_t) in nats, `(B, T)`."""
+        error: Tensor = (self.reward(filtered.features) - batch.reward) / self.reward_std  # (B, T)
+        return -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))
 
 
 @dataclass(frozen=True)

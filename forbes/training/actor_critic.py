@@ -11,11 +11,10 @@ from forbes.control.imagination import belief_samples, frozen
 from forbes.control.policy import Actor, Policy, ScalarHead
 from forbes.control.returns import actor_loss, critic_loss, lambda_returns
 from forbes.data import SequenceBatch
-from forbes.fusion import side_by_side
-from forbes.models import Filtered, State
+from forbes.models import Filtered, Seen, State
 from forbes.models.networks import activate
 from forbes.training.acting import ActingModel
-from forbes.training.world_model import Group, require_at_least
+from forbes.training.world_model import Group, Objective, require_at_least
 
 __all__ = ["ImaginationActorCritic"]
 
@@ -99,21 +98,27 @@ class ImaginationActorCritic(ActingModel):
         """See `ActingModel.choose`: a draw with noise, or the mode."""
         return explore(self.actor, self.exploration) if exploring else take_mode(self.actor)
 
-    def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """See `WorldModel.losses`: the sum of the three, whose gradients do not overlap."""
+    def objectives(self, batch: SequenceBatch) -> list[Objective]:
+        """See `WorldModel.objectives`: the model's, and actor's and critic's; their gradients do not overlap."""
         seen, filtered = self.follow(batch)
-        begins = batch.mask & ~batch.ended  # (B, T)
-        (terms, reward), (actor, critic) = side_by_side(
-            lambda: self.judge(filtered, seen, batch), lambda: self.control_losses(filtered, begins), *filtered, begins
-        )
-        model, values = self.model_loss(terms, reward)
-        values |= {"actor_loss": actor.detach(), "critic_loss": critic.detach()}
-        loss = model + actor + critic
+        return [
+            lambda: self.model_objective(filtered, seen, batch),
+            lambda: self._control_objective(filtered, batch.mask & ~batch.ended),
+        ]
+
+    def model_objective(self, filtered: Filtered, seen: Seen, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """See `ActingModel.model_objective`."""
+        loss, values = super().model_objective(filtered, seen, batch)
         if self.continues is None:
             return loss, values
         sign = torch.where(batch.ended, -1.0, 1.0)  # (B, T)
-        continuation = terms.mean_over_steps(logsigmoid(sign * self.continues(filtered.features)))
+        log_prob = logsigmoid(sign * self.continues(filtered.features))  # (B, T)
+        continuation = (log_prob * batch.mask).sum() / batch.mask.sum()
         return loss - continuation, values | {"continuation": continuation.detach()}
+
+    def _control_objective(self, filtered: Filtered, begins: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        actor, critic = self.control_losses(filtered, begins)
+        return actor + critic, {"actor_loss": actor.detach(), "critic_loss": critic.detach()}
 
     def control_losses(self, filtered: Filtered, begins: Tensor) -> tuple[Tensor, Tensor]:
         """Imagine from beliefs, and give the losses of actor and critic, in units of reward and of its square.

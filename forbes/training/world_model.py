@@ -1,8 +1,8 @@
 """The world model as a LightningModule: it optimises and logs; the mathematics is in `forbes.models`."""
 
 import math
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, cast
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 import torch
 from lightning import LightningModule
@@ -20,7 +20,7 @@ from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, Decoder
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
 
-__all__ = ["Group", "WorldModel", "follow_rates", "require_at_least"]
+__all__ = ["Group", "Objective", "WorldModel", "follow_rates", "require_at_least"]
 
 
 class Group(NamedTuple):
@@ -29,6 +29,10 @@ class Group(NamedTuple):
     name: str
     parameters: list[nn.Parameter]
     rate: float
+
+
+Objective: TypeAlias = Callable[[], tuple[Tensor, dict[str, Tensor]]]
+"""Gives a loss, and what is logged of it: by name, detached."""
 
 
 class WorldModel(LightningModule):
@@ -137,12 +141,18 @@ class WorldModel(LightningModule):
         return loss
 
     def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Give the loss of one update, and what is logged of it: by name, detached.
+        """Give the loss of one update, the sum of all objectives, and what is logged of it: by name, detached."""
+        found = [objective() for objective in self.objectives(batch)]
+        loss = torch.stack([loss for loss, _ in found]).sum()
+        return loss, {name: value for _, values in found for name, value in values.items()}
 
-        It does nothing else, and depends on batch, parameters and noise alone, so that `CudaGraph` can record it.
+    def objectives(self, batch: SequenceBatch) -> list[Objective]:
+        """Compute what the objectives of an update share, and give them: none depends on another.
+
+        They depend on batch, parameters and noise alone, so that `CudaGraph` can record them.
         """
         terms = self.terms(batch)
-        return self.loss(terms), self.measures(terms)
+        return [lambda: (self.loss(terms), self.measures(terms))]
 
     def loss(self, terms: ElboTerms) -> Tensor:
         """Give the loss of this update in nats per step, a scalar."""

@@ -15,7 +15,7 @@ from forbes.fusion import fused, fusing
 from forbes.models import ConvDecoder, ConvEncoder
 from forbes.training import ImaginationActorCritic
 from forbes.training.acting import Acting
-from forbes.training.callbacks.cuda_graph import record
+from forbes.training.callbacks.cuda_graph import Recording
 
 BATCH, TIME = 3, 4
 # The compiler looks at gradients that are not there.
@@ -135,7 +135,7 @@ def test_a_recording_gives_the_losses_and_gradients_of_any_batch(agent, half):
         with precision():
             return agent.losses(batch)
 
-    recorded = record(agent, batches[0], precision)
+    recorded = Recording(agent, batches[0], precision)
     tolerance = {"rtol": 2e-2, "atol": 2e-2} if half else {"rtol": 1e-4, "atol": 1e-5}
     for batch in batches:
         torch.testing.assert_close(results(recorded, agent, batch), results(plain, agent, batch), **tolerance)

@@ -1,19 +1,23 @@
 """An update recorded once on a GPU, and played back: none of its thousands of kernels waits for Python any more."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import cache
 from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from torch import Tensor, nn
+from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.fusion import fusing
 from forbes.training.world_model import WorldModel
 
-__all__ = ["CudaGraph", "record"]
+__all__ = ["CudaGraph", "Recording"]
+
+_WARM_UP = 3
 
 
 class CudaGraph(Callback):
@@ -25,9 +29,15 @@ class CudaGraph(Callback):
 
     On a CPU it does nothing.
 
+    Args:
+        tf32: in the update, form products of float32 numbers from 10 bits of their mantissas, three digits: faster.
+
     Raises:
         ForbesError: where the loss changes from update to update by itself (`kl_warmup`).
     """
+
+    def __init__(self, tf32: bool = False) -> None:
+        self.tf32 = tf32
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Refuse what cannot be recorded."""
@@ -39,37 +49,104 @@ class CudaGraph(Callback):
     ) -> None:
         """Record; the module seeds the noise of its update after this."""
         if isinstance(pl_module, WorldModel) and batch.mask.is_cuda and "losses" not in vars(pl_module):
-            vars(pl_module)["losses"] = record(pl_module, batch, trainer.precision_plugin.forward_context)
+            with _float32_products("high" if self.tf32 else "highest"):
+                vars(pl_module)["losses"] = Recording(pl_module, batch, trainer.precision_plugin.forward_context)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Give the module its own losses back."""
         vars(pl_module).pop("losses", None)
 
 
-def record(
-    module: WorldModel, batch: SequenceBatch, precision: Callable[[], AbstractContextManager[Any]]
-) -> Callable[[SequenceBatch], tuple[Tensor, dict[str, Tensor]]]:
-    """Record the losses of a module on a GPU, with their gradients, for batches of the same shapes.
+class Recording:
+    """The losses of a module on a GPU, with their gradients, for batches of the same shapes.
+
+    All kernels are one graph. Objectives that do not depend on each other are branches of it, gradients included:
+    each alone is too small to fill the device.
 
     Args:
         module: in training mode; its parameters may change their values, not their memory.
         batch: any.
         precision: gives the context of the training's mixed precision.
     """
-    with fusing():
-        recorded: Callable[..., Any] = torch.cuda.make_graphed_callables(
-            _Losses(module, precision), tuple(values.clone() for values in batch), allow_unused_input=True
-        )
-    return lambda batch: recorded(*batch)
 
-
-class _Losses(nn.Module):
-    """The losses of a module as what can be recorded: a function of tensors, which has its parameters."""
-
-    def __init__(self, module: WorldModel, precision: Callable[[], AbstractContextManager[Any]]) -> None:
-        super().__init__()
+    def __init__(
+        self, module: WorldModel, batch: SequenceBatch, precision: Callable[[], AbstractContextManager[Any]]
+    ) -> None:
         self.module, self.precision = module, precision
+        self.parameters = [*module.parameters()]
+        self.batch = SequenceBatch(*(values.clone() for values in batch))
+        self.graph = torch.cuda.CUDAGraph()
+        aside = torch.cuda.Stream()
+        with fusing():
+            aside.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(aside):  # as PyTorch asks for: compilers and libraries make ready
+                for _ in range(_WARM_UP):
+                    self._compute()
+            torch.cuda.current_stream().wait_stream(aside)
+            with torch.cuda.graph(self.graph):
+                self.loss, self.values, self.gradients = self._compute()
 
-    def forward(self, *values: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        with self.precision():  # the gradients' kernels take theirs from the tensors
-            return self.module.losses(SequenceBatch(*values))
+    def __call__(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """See `WorldModel.losses`."""
+        for ours, theirs in zip(self.batch, batch, strict=True):
+            ours.copy_(theirs)
+        self.graph.replay()
+        loss: Tensor = _Played.apply(self.loss, self.gradients, *self.parameters)  # type: ignore[no-untyped-call]
+        return loss, {name: value.clone() for name, value in self.values.items()}
+
+    def _compute(self) -> tuple[Tensor, dict[str, Tensor], list[Tensor | None]]:
+        """Give the loss, what is logged of it, and each parameter's gradient, where it has one."""
+        with self.precision():
+            objectives = self.module.objectives(self.batch)  # holds what branches share until all are done
+        here = torch.cuda.current_stream()
+        streams = [here, *_streams(len(objectives) - 1)]
+        for stream in streams[1:]:
+            stream.wait_stream(here)
+        found = []
+        for objective, stream in zip(objectives, streams, strict=True):
+            with torch.cuda.stream(stream):
+                with self.precision():
+                    loss, values = objective()
+                gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
+            found.append((loss.detach(), values, gradients))
+        for stream in streams[1:]:
+            here.wait_stream(stream)
+        losses, values_of, gradients_of = zip(*found, strict=True)
+        values = {name: value for each in values_of for name, value in each.items()}
+        return torch.stack(losses).sum(), values, [_sum(each) for each in zip(*gradients_of, strict=True)]
+
+
+@contextmanager
+def _float32_products(precision: str) -> Iterator[None]:
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+class _Played(torch.autograd.Function):
+    """Gives a recorded loss, and when asked for its gradients, the recorded ones."""
+
+    @staticmethod
+    def forward(ctx: Any, loss: Tensor, gradients: list[Tensor | None], *parameters: Tensor) -> Tensor:
+        ctx.gradients = gradients
+        return loss.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return None, None, *(None if each is None else each * grad for each in ctx.gradients)
+
+
+@cache
+def _streams(number: int) -> list[torch.cuda.Stream]:
+    """Give streams, the same ones for the gradients' kernels."""
+    return [torch.cuda.Stream() for _ in range(number)]
+
+
+def _sum(gradients: tuple[Tensor | None, ...]) -> Tensor | None:
+    """Add what there is."""
+    found = [each for each in gradients if each is not None]
+    return torch.stack(found).sum(0) if len(found) > 1 else next(iter(found), None)
