@@ -36,7 +36,6 @@ from forbes.models import MLPDecoder, MLPEncoder, VectorNormal
 from forbes.training import ImaginationActorCritic
 from forbes.training.callbacks.cuda_graph import Recording
 
-PARTS = ("loading", "model", "imagination", "update", "recorded", "acting")
 EPISODES = 10
 NAMES = {"dreamer": "Dreamer, N = 1", "forbes": "FORBES, N = 1", "forbes4": "FORBES, N = 4"}
 
@@ -145,9 +144,7 @@ class Work:
         self._step(loss)
 
     def recorded(self) -> None:
-        """Make an update whose losses and gradients are played back; on a CPU, the same as any."""
-        if self.device.type == "cpu":
-            return
+        """Make an update whose losses and gradients are played back, on a GPU."""
         self._step(self.losses(self.batch)[0])
 
     def act(self) -> None:
@@ -162,8 +159,10 @@ class Work:
 
     def seconds(self) -> dict[str, float]:
         """Do everything once and say how long each took."""
-        works = (self.loading, self.model, self.imagination, self.update, self.recorded, self.act)
-        return {part: self._time(work) for part, work in zip(PARTS, works, strict=True)}
+        works = {"loading": self.loading, "model": self.model, "imagination": self.imagination, "update": self.update}
+        if self.device.type == "cuda":
+            works["recorded"] = self.recorded
+        return {part: self._time(work) for part, work in (works | {"acting": self.act}).items()}
 
     def _step(self, loss: Tensor) -> None:
         self._backward(loss)
@@ -222,7 +221,9 @@ def measure(name: str, device: torch.device, options: argparse.Namespace) -> lis
         for _ in range(options.repeats + 2):
             for form, work in works.items():
                 rounds[form].append(work.seconds())
-    times = {form: {part: [each[part] for each in seconds[2:]] for part in PARTS} for form, seconds in rounds.items()}
+    times = {
+        form: {part: [each[part] for each in seconds[2:]] for part in seconds[0]} for form, seconds in rounds.items()
+    }
     of_step = environment_step(make)
     return [row(name, form, times, operations[form], of_step) for form in NAMES]
 
@@ -231,7 +232,8 @@ def row(name: str, form: str, times: dict[str, dict[str, list[float]]], operatio
     """Write one row: milliseconds, then ratios of whole updates, round by round."""
     ours = times[form]
     milliseconds = " | ".join(
-        f"{1e3 * statistics.median(ours[part]):.1f}" for part in ("model", "imagination", "update", "recorded")
+        f"{1e3 * statistics.median(ours[part]):.1f}" if part in ours else "n/a"
+        for part in ("model", "imagination", "update", "recorded")
     )
     over = " | ".join(f"{ratio(ours['update'], times[other]['update']):.2f}" for other in ("dreamer", "forbes"))
     loading = f"{1e3 * statistics.median(ours['loading']):.2f} ({ratio(ours['loading'], ours['update']):.1%})"

@@ -1,7 +1,7 @@
 """A recorded update: elementwise functions that the compiler fuses, and, where there is a GPU, the playback."""
 
 import json
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import partial
 
 import pytest
@@ -11,10 +11,12 @@ from small_agents import fit, write_config
 import forbes.fusion
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
+from forbes.errors import ForbesError
 from forbes.fusion import fused, fusing
 from forbes.models import ConvDecoder, ConvEncoder
 from forbes.training import ImaginationActorCritic
 from forbes.training.acting import Acting
+from forbes.training.callbacks import cuda_graph
 from forbes.training.callbacks.cuda_graph import Recording
 
 BATCH, TIME = 3, 4
@@ -120,6 +122,67 @@ def test_an_agent_that_plays_in_another_process_leaves_the_recording_behind(agen
     vars(agent)["losses"] = lambda _: None
 
     assert Acting.as_it_is(agent, exploring=True).agent.losses(make_batch(0))[0].isfinite()
+
+
+class NoStream:
+    def wait_stream(self, other):
+        pass
+
+
+class NoGraph:
+    def replay(self):
+        pass
+
+
+@pytest.fixture
+def without_device(monkeypatch):
+    """Let a recording run on a CPU: what it computes while it records is what it plays back."""
+
+    @contextmanager
+    def recorded(graph):
+        torch.manual_seed(1)
+        yield
+
+    for name, stand_in in {
+        "Stream": NoStream,
+        "CUDAGraph": NoGraph,
+        "current_stream": NoStream,
+        "stream": lambda _: nullcontext(),
+        "graph": recorded,
+    }.items():
+        monkeypatch.setattr(torch.cuda, name, stand_in)
+    monkeypatch.setattr(forbes.fusion, "_compiled", lambda function: function)
+    yield
+    cuda_graph._streams.cache_clear()
+
+
+@pytest.mark.usefixtures("without_device")
+def test_the_branches_of_a_recording_add_up_to_the_whole(agent):
+    recorded = Recording(agent, make_batch(0), nullcontext)
+
+    torch.testing.assert_close(results(recorded, agent, make_batch(0)), results(agent.losses, agent, make_batch(0)))
+
+
+@pytest.mark.usefixtures("without_device")
+def test_a_scaled_loss_has_scaled_gradients(agent):
+    recorded = Recording(agent, make_batch(0), nullcontext)
+    _, _, once = results(recorded, agent, make_batch(0))
+    _, _, thrice = results(lambda batch: (3 * recorded(batch)[0], {}), agent, make_batch(0))
+
+    torch.testing.assert_close(thrice, tuple(3 * gradient for gradient in once))
+
+
+@pytest.mark.usefixtures("without_device")
+def test_an_update_that_cannot_be_recorded_is_one_sentence(agent, monkeypatch):
+    @contextmanager
+    def refuse(graph):
+        raise RuntimeError("CUDA error: operation not permitted when stream is capturing\nmore of it")
+        yield
+
+    monkeypatch.setattr(torch.cuda, "graph", refuse)
+
+    with pytest.raises(ForbesError, match=r"CudaGraph: the update of ImaginationActorCritic cannot be recorded \(CUDA"):
+        Recording(agent, make_batch(0), nullcontext)
 
 
 @on_gpu

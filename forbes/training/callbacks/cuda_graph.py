@@ -21,19 +21,19 @@ _WARM_UP = 3
 
 
 class CudaGraph(Callback):
-    """Records the losses of an update and their gradients as CUDA graphs, before the first update of a fit.
+    """Records the losses of an update and their gradients as a CUDA graph, before the first update of a fit.
 
-    Every later update copies its batch to where the first one lay, and plays them back: the same kernels with new
-    noise, started by the device itself. What is elementwise between matrix products is one kernel (`forbes.fusion`).
-    Clipping and Adam stay as they are. The numbers are those of a training without it, up to rounding.
-
-    On a CPU it does nothing.
+    Every update then copies its batch to where the first one lay, and plays it back: the same kernels with new noise,
+    started by the device itself. What is elementwise between matrix products is one kernel (`forbes.fusion`). Clipping
+    and Adam stay as they are. The numbers are those of a training without it, up to rounding. `benchmarks/gpu.md` has
+    the gain; compilers take about a minute before the first update. On a CPU it does nothing.
 
     Args:
         tf32: in the update, form products of float32 numbers from 10 bits of their mantissas, three digits: faster.
 
     Raises:
-        ForbesError: where the loss changes from update to update by itself (`kl_warmup`).
+        ForbesError: where the loss changes from update to update by itself (`kl_warmup`), or the program waits for a
+            number from the device.
     """
 
     def __init__(self, tf32: bool = False) -> None:
@@ -60,8 +60,8 @@ class CudaGraph(Callback):
 class Recording:
     """The losses of a module on a GPU, with their gradients, for batches of the same shapes.
 
-    All kernels are one graph. Objectives that do not depend on each other are branches of it, gradients included:
-    each alone is too small to fill the device.
+    All kernels are one graph. The objectives, which do not depend on each other, are branches of it, gradients
+    included: each alone is too small to fill the device.
 
     Args:
         module: in training mode; its parameters may change their values, not their memory.
@@ -83,8 +83,15 @@ class Recording:
                 for _ in range(_WARM_UP):
                     self._compute()
             torch.cuda.current_stream().wait_stream(aside)
-            with torch.cuda.graph(self.graph):
-                self.loss, self.values, self.gradients = self._compute()
+            try:
+                with torch.cuda.graph(self.graph):
+                    self.loss, self.values, self.gradients = self._compute()
+            except RuntimeError as error:
+                reason = str(error).partition("\n")[0]
+                raise ForbesError(
+                    f"CudaGraph: the update of {type(module).__name__} cannot be recorded ({reason}), expected "
+                    "one that never waits for a number from the device. Leave CudaGraph out"
+                ) from error
 
     def __call__(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """See `WorldModel.losses`."""
