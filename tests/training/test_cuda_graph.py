@@ -16,7 +16,7 @@ from forbes.fusion import fused, fusing
 from forbes.models import ConvDecoder, ConvEncoder
 from forbes.training import ImaginationActorCritic
 from forbes.training.acting import Acting
-from forbes.training.callbacks import cuda_graph
+from forbes.training.callbacks import CudaGraph, cuda_graph
 from forbes.training.callbacks.cuda_graph import Recording
 
 BATCH, TIME = 3, 4
@@ -122,6 +122,14 @@ def test_an_agent_that_plays_in_another_process_leaves_the_recording_behind(agen
     vars(agent)["losses"] = lambda _: None
 
     assert Acting.as_it_is(agent, exploring=True).agent.losses(make_batch(0))[0].isfinite()
+
+
+def test_after_a_fit_a_module_has_its_own_losses_again(agent):
+    vars(agent)["losses"] = lambda _: None
+
+    CudaGraph().teardown(None, agent, "fit")
+
+    assert agent.losses(make_batch(0))[0].isfinite()
 
 
 class NoStream:
