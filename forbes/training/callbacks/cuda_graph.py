@@ -32,8 +32,8 @@ class CudaGraph(Callback):
         tf32: in the update, form products of float32 numbers from 10 bits of their mantissas, three digits: faster.
 
     Raises:
-        ForbesError: where the loss changes from update to update by itself (`kl_warmup`), or the program waits for a
-            number from the device.
+        ForbesError: where the loss changes from update to update by itself (`kl_warmup`), the program waits for a
+            number from the device, or there is no triton or C compiler.
     """
 
     def __init__(self, tf32: bool = False) -> None:
@@ -76,22 +76,17 @@ class Recording:
         self.parameters = [*module.parameters()]
         self.batch = SequenceBatch(*(values.clone() for values in batch))
         self.graph = torch.cuda.CUDAGraph()
-        aside = torch.cuda.Stream()
-        with fusing():
-            aside.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(aside):  # as PyTorch asks for: compilers and libraries make ready
-                for _ in range(_WARM_UP):
-                    self._compute()
-            torch.cuda.current_stream().wait_stream(aside)
-            try:
+        try:
+            with fusing():
+                self._warm_up()
                 with torch.cuda.graph(self.graph):
                     self.loss, self.values, self.gradients = self._compute()
-            except RuntimeError as error:
-                reason = str(error).partition("\n")[0]
-                raise ForbesError(
-                    f"CudaGraph: the update of {type(module).__name__} cannot be recorded ({reason}), expected "
-                    "one that never waits for a number from the device. Leave CudaGraph out"
-                ) from error
+        except RuntimeError as error:  # of CUDA, and of the compiler
+            name, reason = type(module).__name__, str(error).strip().partition("\n")[0]
+            raise ForbesError(
+                f"CudaGraph: the update of {name} cannot be recorded ({reason}); it must not wait for a number from the "
+                "device, and needs triton and a C compiler. Leave CudaGraph out"
+            ) from error
 
     def __call__(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """See `WorldModel.losses`."""
@@ -100,6 +95,15 @@ class Recording:
         self.graph.replay()
         loss: Tensor = _Played.apply(self.loss, self.gradients, *self.parameters)  # type: ignore[no-untyped-call]
         return loss, {name: value.clone() for name, value in self.values.items()}
+
+    def _warm_up(self) -> None:
+        """Compute on another stream, as PyTorch asks for: the compiler and libraries make ready."""
+        here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
+        aside.wait_stream(here)
+        with torch.cuda.stream(aside):
+            for _ in range(_WARM_UP):
+                self._compute()
+        here.wait_stream(aside)
 
     def _compute(self) -> tuple[Tensor, dict[str, Tensor], list[Tensor | None]]:
         """Give the loss, what is logged of it, and each parameter's gradient, where it has one."""
