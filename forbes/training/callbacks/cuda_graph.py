@@ -84,8 +84,8 @@ class Recording:
         except RuntimeError as error:  # of CUDA, and of the compiler
             name, reason = type(module).__name__, str(error).strip().partition("\n")[0]
             raise ForbesError(
-                f"CudaGraph: the update of {name} cannot be recorded ({reason}); it must not wait for a number from the "
-                "device, and needs triton and a C compiler. Leave CudaGraph out"
+                f"CudaGraph: the update of {name} cannot be recorded ({reason}); it must not wait for a number from "
+                "the device, and needs triton and a C compiler. Leave CudaGraph out"
             ) from error
 
     def __call__(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
