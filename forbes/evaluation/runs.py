@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -18,7 +19,8 @@ from forbes.models import BeliefModel, ParticleModel, StateSpaceModel, VectorMod
 from forbes.training.loading import load_run
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "require_comparable", "split_batches"]
+__all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "require_comparable", "run_titles"]
+__all__ += ["split_batches"]
 
 _FAMILIES: dict[type[nn.Module], str] = {
     GaussianBelief: "RSSM",
@@ -54,6 +56,19 @@ class TrainedRun(NamedTuple):
     def parameters(self) -> int:
         """How many numbers were learned."""
         return sum(parameter.numel() for parameter in self.model.parameters())
+
+
+def run_titles(runs: Sequence[TrainedRun]) -> list[str]:
+    """Name runs for a picture: by family, and where several are of one, by what their folders do not share."""
+    folders: dict[str, list[Path]] = {}
+    for run in runs:
+        folders.setdefault(run.family, []).append(Path(run.path).resolve())
+    titles = []
+    for run in runs:
+        name, same = run.family, folders[run.family]
+        own = Path(run.path).resolve().relative_to(os.path.commonpath(same))
+        titles.append(name if len(same) == 1 else f"{name} ({own})")
+    return titles
 
 
 def find_device(name: str) -> str:

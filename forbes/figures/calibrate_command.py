@@ -13,7 +13,7 @@ from rich.table import Table
 from forbes.arguments import ArgumentParser, positive
 from forbes.errors import ForbesError
 from forbes.evaluation.calibration import coverage
-from forbes.evaluation.runs import TrainedRun, load_runs
+from forbes.evaluation.runs import TrainedRun, load_runs, run_titles
 from forbes.evaluation.self_calibration import SelfCalibration, self_calibration
 from forbes.evaluation.uniformity import pearson
 from forbes.figures.calibration import RankedBelief, calibration
@@ -39,10 +39,9 @@ def main(argv: Sequence[str]) -> None:
     runs = load_runs(args.runs)
     found = [_check(run, args.sequences, args.time, args.samples, args.seed) for run in runs]
     _print(runs, found, args.samples)
-    names = [run.family for run in runs]
     beliefs = [
-        RankedBelief(name if names.count(name) == 1 else f"{name} ({run.path})", colour, one.value, one.density)
-        for run, name, colour, one in zip(runs, names, cycle(PALETTE), found, strict=False)
+        RankedBelief(title, colour, one.value, one.density)
+        for title, colour, one in zip(run_titles(runs), cycle(PALETTE), found, strict=False)
     ]
     figure = calibration(beliefs, args.samples)
     for suffix in (".png", ".pdf"):

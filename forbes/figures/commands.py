@@ -16,7 +16,7 @@ from forbes.data import Strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import whole_sequences
 from forbes.evaluation.record import read_record
-from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable
+from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
 from forbes.figures.returns import returns_against_env_steps
 from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
 from forbes.figures.style import PALETTE, save_figure
@@ -110,13 +110,11 @@ def group(runs: Sequence[TrainedRun]) -> list[Family]:
             members.append([run])
         else:
             same.append(run)
-    names = [runs_of_one[0].family for runs_of_one in members]
     families = []
-    for runs_of_one, name, colour in zip(members, names, cycle(PALETTE), strict=False):
-        first = runs_of_one[0]
-        title = name if names.count(name) == 1 else f"{name} ({first.path})"
+    titles = run_titles([first for first, *_ in members])
+    for runs_of_one, title, colour in zip(members, titles, cycle(PALETTE), strict=False):
         tests = [value for run in runs_of_one if (value := _test_elbo(run)) is not None]
-        families.append(Family(title, colour, first.model, [_curve(run) for run in runs_of_one], tests))
+        families.append(Family(title, colour, runs_of_one[0].model, [_curve(run) for run in runs_of_one], tests))
     return families
 
 

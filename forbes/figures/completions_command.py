@@ -14,7 +14,7 @@ from forbes.data.digit_classifiers import CLASSIFIERS_SHA256, load_judges
 from forbes.errors import ForbesError
 from forbes.evaluation.completion_study import Study, entries, print_study, study
 from forbes.evaluation.completions import prefixes
-from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable
+from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
 from forbes.figures.completions import by_ambiguity, drawings, errors, scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
@@ -56,7 +56,7 @@ def main(argv: Sequence[str]) -> None:
     require_comparable(runs, hashes)
     assert isinstance(data.source, Strokes)
     judges = load_judges(data.source.origin)
-    named = dict(zip(_names(runs), runs, strict=True))
+    named = dict(zip(run_titles(runs), runs, strict=True))
     studies = []
     for context in sorted(set(args.prefixes)):
         beginnings = prefixes(data, args.split, args.digits, context, judges.prefix)
@@ -102,14 +102,6 @@ def _check(args: Any, runs: Sequence[TrainedRun]) -> None:
             )
     if args.samples < 2:
         raise ForbesError(f"--samples {args.samples}: expected at least 2, since completions are compared. Choose more")
-
-
-def _names(runs: Sequence[TrainedRun]) -> list[str]:
-    """Tell runs of one family apart by their folder."""
-    families = [run.family for run in runs]
-    return [
-        name if families.count(name) == 1 else f"{name} ({run.path})" for name, run in zip(families, runs, strict=True)
-    ]
 
 
 def _describe(name: str, run: TrainedRun) -> dict[str, Any]:

@@ -71,11 +71,11 @@ def test_runs_that_differ_in_the_seed_only_are_one_family(runs, tmp_path):
     assert families[0].colour != families[1].colour
 
 
-def test_families_of_one_name_are_told_apart_by_their_folder(runs, tiny_config, tmp_path):
-    other = str(tmp_path / "deep")
+def test_families_of_one_name_are_told_apart_by_what_their_folders_do_not_share(runs, tiny_config, tmp_path):
+    one, other = str(shutil.copytree(runs[0], tmp_path / "flat")), str(tmp_path / "deep")
     main(["fit", "--config", str(tiny_config), "--run_dir", other, "--model.init_args.belief.init_args.layers", "3"])
-    names = [family.name for family in group(load_runs([runs[0], other]))]
-    assert names == [f"FORBES ({runs[0]})", f"FORBES ({other})"]
+    names = [family.name for family in group(load_runs([one, other]))]
+    assert names == ["FORBES (flat)", "FORBES (deep)"]
 
 
 def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo(runs, tmp_path):
