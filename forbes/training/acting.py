@@ -91,13 +91,14 @@ class ActingModel(WorldModel, ABC):
     def model_objective(self, filtered: Filtered, seen: Seen, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """Give the loss of model and reward in nats per step, and what is logged of it, along a trajectory."""
         terms = self.model.bound(filtered, seen, batch.mask)
-        reward = terms.mean_over_steps(self.reward_log_prob(filtered, batch))
-        return self.loss(terms) - reward, self.measures(terms) | {"reward": reward.detach()}
+        means = {name: terms.mean_over_steps(values) for name, values in self.log_probs(filtered, batch).items()}
+        loss = self.loss(terms) - sum(means.values())
+        return loss, self.measures(terms) | {name: mean.detach() for name, mean in means.items()}
 
-    def reward_log_prob(self, filtered: Filtered, batch: SequenceBatch) -> Tensor:
-        """Give log p(r_t | f_t) in nats, `(B, T)`."""
+    def log_probs(self, filtered: Filtered, batch: SequenceBatch) -> dict[str, Tensor]:
+        """Give what the model learns besides observations, by name: log p(r_t | f_t) in nats, `(B, T)`."""
         error: Tensor = (self.reward(filtered.features) - batch.reward) / self.reward_std  # (B, T)
-        return -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))
+        return {"reward": -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))}
 
 
 @dataclass(frozen=True)

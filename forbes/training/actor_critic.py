@@ -11,7 +11,7 @@ from forbes.control.imagination import belief_samples, frozen
 from forbes.control.policy import Actor, Policy, ScalarHead
 from forbes.control.returns import actor_loss, critic_loss, lambda_returns
 from forbes.data import SequenceBatch
-from forbes.models import Filtered, Seen, State
+from forbes.models import Filtered, State
 from forbes.models.networks import activate
 from forbes.training.acting import ActingModel
 from forbes.training.world_model import Group, Objective, require_at_least
@@ -106,15 +106,13 @@ class ImaginationActorCritic(ActingModel):
             lambda: self._control_objective(filtered, batch.mask & ~batch.ended),
         ]
 
-    def model_objective(self, filtered: Filtered, seen: Seen, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """See `ActingModel.model_objective`."""
-        loss, values = super().model_objective(filtered, seen, batch)
-        if self.continues is None:
-            return loss, values
-        sign = torch.where(batch.ended, -1.0, 1.0)  # (B, T)
-        log_prob = logsigmoid(sign * self.continues(filtered.features))  # (B, T)
-        continuation = (log_prob * batch.mask).sum() / batch.mask.sum()
-        return loss - continuation, values | {"continuation": continuation.detach()}
+    def log_probs(self, filtered: Filtered, batch: SequenceBatch) -> dict[str, Tensor]:
+        """See `ActingModel.log_probs`; with `continuation`, log p(c_t | f_t) too."""
+        found = super().log_probs(filtered, batch)
+        if self.continues is not None:
+            sign = torch.where(batch.ended, -1.0, 1.0)  # (B, T)
+            found["continuation"] = logsigmoid(sign * self.continues(filtered.features))  # (B, T)
+        return found
 
     def _control_objective(self, filtered: Filtered, begins: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         actor, critic = self.control_losses(filtered, begins)

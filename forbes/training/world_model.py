@@ -20,7 +20,7 @@ from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, Decoder
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
 
-__all__ = ["Group", "Objective", "WorldModel", "follow_rates", "require_at_least"]
+__all__ = ["Group", "Objective", "WorldModel", "follow_rates", "require_at_least", "together"]
 
 
 class Group(NamedTuple):
@@ -142,9 +142,7 @@ class WorldModel(LightningModule):
 
     def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """Give the loss of one update, the sum of all objectives, and what is logged of it: by name, detached."""
-        found = [objective() for objective in self.objectives(batch)]
-        loss = torch.stack([loss for loss, _ in found]).sum()
-        return loss, {name: value for _, values in found for name, value in values.items()}
+        return together([objective() for objective in self.objectives(batch)])
 
     def objectives(self, batch: SequenceBatch) -> list[Objective]:
         """Compute what the objectives of an update share, and give them: none depends on another.
@@ -224,6 +222,13 @@ class WorldModel(LightningModule):
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what `CudaGraph` has put in the place of `losses`: it belongs to one process."""
         return {name: value for name, value in super().__getstate__().items() if name != "losses"}
+
+
+def together(found: Sequence[tuple[Tensor, dict[str, Tensor]]]) -> tuple[Tensor, dict[str, Tensor]]:
+    """Give the sum of the losses that objectives have found, and all that is logged of them."""
+    (first, _), *others = found
+    loss = sum((loss for loss, _ in others), first)
+    return loss, {name: value for _, values in found for name, value in values.items()}
 
 
 def follow_rates(module: LightningModule, rates: Sequence[float]) -> None:

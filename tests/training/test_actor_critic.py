@@ -71,7 +71,7 @@ def test_the_world_model_learns_from_its_own_loss_only(reward_std):
     reward = torch.distributions.Normal(ours.reward(filtered.features), reward_std).log_prob(batch.reward)
 
     torch.manual_seed(1)
-    torch.testing.assert_close(ours.reward_log_prob(filtered, batch), reward)
+    torch.testing.assert_close(ours.log_probs(filtered, batch)["reward"], reward)
     own = gradients(ours.loss(terms) - reward.mean(), [ours.model, ours.reward])
     together = gradients(loss_of(ours, batch), [ours.model, ours.reward])
 

@@ -6,6 +6,7 @@ from functools import partial
 
 import pytest
 import torch
+from lightning import LightningModule
 from small_agents import fit, write_config
 
 import forbes.fusion
@@ -74,7 +75,9 @@ def trained(folder, name, *changes):
     config.write_text(text)
     assert fit("--config", config, "--run_dir", folder / name) == 0
     rows = [json.loads(line) for line in (folder / name / "metrics.jsonl").read_text().splitlines()]
-    return [{key: value for key, value in row.items() if key.startswith("train/")} for row in rows]
+    found = [{key: value for key, value in row.items() if key.startswith("train/")} for row in rows]
+    assert any(found)
+    return found
 
 
 WITH = ("  callbacks:\n", "  callbacks:\n    - {class_path: CudaGraph}\n")
@@ -116,6 +119,11 @@ def test_a_loss_that_changes_by_itself_is_refused(tmp_path, capsys):
 
     assert fit("--config", config, "--model.kl_warmup", 10, "--run_dir", tmp_path / "run") == 2
     assert "CudaGraph: kl_warmup weighs every update anew, expected 0" in capsys.readouterr().err
+
+
+def test_what_is_no_world_model_is_refused():
+    with pytest.raises(ForbesError, match="CudaGraph: found a LightningModule, expected a WorldModel or an agent"):
+        CudaGraph().on_fit_start(None, LightningModule())
 
 
 def test_an_agent_that_plays_in_another_process_leaves_the_recording_behind(agent):

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning import Callback, LightningModule, Trainer
@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.fusion import fusing
-from forbes.training.world_model import WorldModel
+from forbes.training.world_model import WorldModel, together
 
 __all__ = ["CudaGraph", "Recording"]
 
@@ -32,8 +32,8 @@ class CudaGraph(Callback):
         tf32: in the update, form products of float32 numbers from 10 bits of their mantissas, three digits: faster.
 
     Raises:
-        ForbesError: where the loss changes from update to update by itself (`kl_warmup`), the program waits for a
-            number from the device, or there is no triton or C compiler.
+        ForbesError: where no world model learns, the loss changes from update to update by itself (`kl_warmup`), the
+            program waits for a number from the device, or there is no triton or C compiler.
     """
 
     def __init__(self, tf32: bool = False) -> None:
@@ -41,16 +41,20 @@ class CudaGraph(Callback):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Refuse what cannot be recorded."""
-        if getattr(pl_module, "kl_warmup", 0):
+        if not isinstance(pl_module, WorldModel):
+            name = type(pl_module).__name__
+            raise ForbesError(f"CudaGraph: found a {name}, expected a WorldModel or an agent. Leave CudaGraph out")
+        if pl_module.kl_warmup:
             raise ForbesError("CudaGraph: kl_warmup weighs every update anew, expected 0. Leave one of them out")
 
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: SequenceBatch, batch_idx: int
     ) -> None:
         """Record; the module seeds the noise of its update after this."""
-        if isinstance(pl_module, WorldModel) and batch.mask.is_cuda and "losses" not in vars(pl_module):
+        module = cast(WorldModel, pl_module)
+        if batch.mask.is_cuda and "losses" not in vars(module):
             with _float32_products("high" if self.tf32 else "highest"):
-                vars(pl_module)["losses"] = Recording(pl_module, batch, trainer.precision_plugin.forward_context)
+                vars(module)["losses"] = Recording(module, batch, trainer.precision_plugin.forward_context)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Give the module its own losses back."""
@@ -113,18 +117,17 @@ class Recording:
         streams = [here, *_streams(len(objectives) - 1)]
         for stream in streams[1:]:
             stream.wait_stream(here)
-        found = []
+        found, gradients_of = [], []
         for objective, stream in zip(objectives, streams, strict=True):
             with torch.cuda.stream(stream):
                 with self.precision():
                     loss, values = objective()
-                gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
-            found.append((loss.detach(), values, gradients))
+                gradients_of.append(torch.autograd.grad(loss, self.parameters, allow_unused=True))
+            found.append((loss.detach(), values))
         for stream in streams[1:]:
             here.wait_stream(stream)
-        losses, values_of, gradients_of = zip(*found, strict=True)
-        values = {name: value for each in values_of for name, value in each.items()}
-        return torch.stack(losses).sum(), values, [_sum(each) for each in zip(*gradients_of, strict=True)]
+        loss, values = together(found)
+        return loss, values, [_sum(each) for each in zip(*gradients_of, strict=True)]
 
 
 @contextmanager
