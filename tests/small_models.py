@@ -4,7 +4,7 @@ from functools import partial
 
 import torch
 
-from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ParticleModel, State, StateSpaceModel, VectorModel
 
 BATCH, TIME, ACTION, STATE, HIDDEN = 5, 6, 2, 4, 7
@@ -15,6 +15,9 @@ STATE_SPACE = {
     "flow": partial(StateSpaceModel, FLOW),
     "flow in the posterior": partial(StateSpaceModel, FLOW, prior=GaussianBelief),
     "flow in the prior": partial(StateSpaceModel, GaussianBelief, prior=FLOW),
+    "spline flow": partial(StateSpaceModel, partial(FLOW, coupling="spline", bins=4)),
+    "mixture": partial(StateSpaceModel, partial(MixtureBelief, components=3)),
+    "categorical": partial(StateSpaceModel, partial(CategoricalBelief, classes=2)),
 }
 MODELS = STATE_SPACE | {
     "particles": partial(ParticleModel, GaussianBelief, particles=3),
@@ -51,6 +54,8 @@ def random_model(kind, seed=0):
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.1 * torch.rand_like(parameter).sub(0.5)
+        if kind == "categorical":  # what changes a probability by little changes no draw
+            model.posterior.logits_of.weight *= 50
     return model
 
 

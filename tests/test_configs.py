@@ -9,7 +9,7 @@ import yaml
 from forbes.training.configuration import allow_modules, experiment_parser
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-CLAIM = re.compile(r"parameter count of forbes\.yaml \(([\d,]+) against ([\d,]+)\)")
+CLAIM = re.compile(r"\(([\d,]+)(?: parameters)? against ([\d,]+)\)")
 MATCHED = [path for path in sorted(CONFIGS.rglob("*.yaml")) if CLAIM.search(path.read_text())]
 
 

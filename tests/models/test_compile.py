@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
 from forbes.models import (
     Bernoulli,
     MLPDecoder,
@@ -20,6 +20,9 @@ SHAPE = (1, 4, 4)
 MODELS = {  # and D
     "gaussian": (partial(StateSpaceModel, GaussianBelief), 2),
     "flow": (partial(StateSpaceModel, partial(FlowBelief, layers=2, width=4)), 2),
+    "spline flow": (partial(StateSpaceModel, partial(FlowBelief, layers=1, width=4, coupling="spline", bins=3)), 2),
+    "mixture": (partial(StateSpaceModel, partial(MixtureBelief, components=2)), 2),
+    "categorical": (partial(StateSpaceModel, partial(CategoricalBelief, classes=2)), 2),
     "particles": (partial(ParticleModel, GaussianBelief, particles=3, resampling="soft"), 2),
     "vector": (partial(VectorModel, GaussianBelief, overshoot=1), 0),
 }

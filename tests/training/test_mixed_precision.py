@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
 from forbes.cli import main
 from forbes.data import SequenceBatch
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ParticleModel, StateSpaceModel, VectorModel
@@ -31,6 +31,9 @@ SIZES = {
 MODELS = {
     "gaussian": {"belief": GaussianBelief},
     "flow": {"belief": FLOW},
+    "spline flow": {"belief": partial(FLOW, coupling="spline", bins=3)},
+    "mixture": {"belief": partial(MixtureBelief, components=2)},
+    "categorical": {"belief": partial(CategoricalBelief, classes=2)},
     "particles": {"belief": FLOW, "model": partial(ParticleModel, particles=3, resampling="soft")},
     "vector": {"model": partial(VectorModel, overshoot=2), "state_dim": 0},
 }
