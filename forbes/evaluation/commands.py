@@ -30,7 +30,7 @@ from forbes.evaluation.runs import (
     split_batches,
 )
 from forbes.evaluation.scoring import PASSES, Parts, Pass, exact_pass, make_pass, score_split
-from forbes.evaluation.tables import print_pairs, print_runs
+from forbes.evaluation.tables import print_degradation, print_pairs, print_runs
 from forbes.training.provenance import commit
 from forbes.training.run_folder import RunFolder
 
@@ -53,7 +53,8 @@ certain. So beside it:
   pll        log p(o_t | o_1..t-1) summed over t, by K particles of the belief: the proper score of the filtering
              belief; and the IWAE bound, by the same trajectories
   fivo       the sequential Monte-Carlo bound, by K particles, and their effective sample size
-  open-loop  log p(rest | beginning), by K futures that start in the belief
+  open-loop  log p(rest | beginning), by K futures that start in the belief; with pll, the degradation: how much a
+             prediction loses with each step that it has not seen
 
 Data of a known process add log_p, the exact log p(o_1..T), which no bound exceeds. A VectorModel has no bounds, since
 its likelihood is exact, and pll gives it; pll and open-loop of a ParticleModel are those of its own sets of particles.
@@ -91,6 +92,7 @@ def main(argv: Sequence[str]) -> None:
     print_runs(measured)
     if len(measured) > 1:
         print_pairs(pair(measured))
+    print_degradation(measured)
 
 
 def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
@@ -124,9 +126,8 @@ def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
     return measured
 
 
-def wanted_metrics(paths: Sequence[str], args: Any) -> list[dict[str, bool]]:
+def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[dict[str, bool]]:
     """Name the metrics that `evaluate` measures runs by, and tell for each run whether its model has them."""
-    runs = load_runs(paths)
     jobs = _jobs(args, runs)
     return [
         {
@@ -191,13 +192,21 @@ def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
             hashes[count] = [data_sha256(run.data, args.split, count) for run in runs]
             require_comparable(runs, hashes[count])
         jobs.append(_Job(name, score, count, hashes[count]))
-    length = runs[0].data.length
-    if "open-loop" in args.scores and args.context >= length:
-        raise ForbesError(
-            f"--context {args.context}: the sequences of {runs[0].path} have {length} steps, expected a context below "
-            "that. Choose a smaller one, or name other --scores"
-        )
+        if name == "open-loop":
+            _require_longer(runs[0], args, count)
     return jobs
+
+
+def _require_longer(run: TrainedRun, args: Any, count: int) -> None:
+    """Refuse sequences that end within the context: nothing of them would be left to score."""
+    for first, batch in split_batches(run.data, args.split, count, batch_size=500):
+        length = batch.mask.sum(1)  # (B,)
+        if (length <= args.context).any():
+            place = int(length.argmin())
+            raise ForbesError(
+                f"--context {args.context}: sequence {first + place} of the {args.split} split of {run.path} has "
+                f"{length[place]} steps, expected more. Choose a smaller context, or name other --scores"
+            )
 
 
 def _of(run: TrainedRun, jobs: Sequence[_Job]) -> list[_Job]:
@@ -238,7 +247,7 @@ def _measure(one: Measured, job: _Job, sha256: str, args: Any) -> Parts:
     scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts)
     for metric in score.metrics:
         name = _metric_name(run, job, metric, args.split)
-        one.totals[name] = scores.values[metric].sum(1)  # (N,)
+        one.totals[name] = scores.total(metric)
         one.entries[name] = describe(scores, metric) | {
             "data": {"name": data_name(run.data), "sha256": sha256},
             "checkpoint": checkpoint,

@@ -14,6 +14,7 @@ import pandas as pd
 import torch
 
 from forbes.errors import ForbesError
+from forbes.evaluation.degradation import at_horizons, degradation
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.measured import SCORES, score_of
 from forbes.evaluation.record import read_arrays, read_record
@@ -27,6 +28,8 @@ class Family(NamedTuple):
     name: str
     runs: Mapping[int, str]
     """Run folders by seed."""
+    parameters: int
+    """Of each of its models."""
     lacks: Collection[str] = ()
     """Metrics that its models do not have."""
 
@@ -41,7 +44,7 @@ class Comparison(NamedTuple):
     """A row for each family but the first, score and seed: mean and standard_error of family - first, paired, where
     both have it."""
     curves: dict[str, dict[str, list[float]]]
-    """By metric and family that has it, the mean of each step over sequences and seeds."""
+    """By metric and family that has it, the mean of each step over sequences and seeds; of the `degradation` too."""
 
 
 def compare(families: Sequence[Family], metrics: Sequence[str]) -> Comparison:
@@ -59,8 +62,9 @@ def compare(families: Sequence[Family], metrics: Sequence[str]) -> Comparison:
             name: np.mean([entry["curve"] for entry in of_runs], axis=0).tolist() for name, of_runs in entries.items()
         }
         for family in families:
-            own = entries.get(family.name) or [_blank(run, entries[having[0].name][0]) for run in family.runs.values()]
+            own = entries.get(family.name) or [_blank(entries[having[0].name][0])] * len(family.runs)
             rows += [_row(family, metric, seed, entry) for seed, entry in zip(family.runs, own, strict=True)]
+    curves |= degradation(curves)
     scores = [metric for metric in metrics if score_of(metric) in SCORES and metric not in families[0].lacks]
     others = [(metric, other) for metric in scores for other in families[1:] if metric not in other.lacks]
     differences = [difference for metric, other in others for difference in _paired(other, families[0], metric)]
@@ -78,11 +82,9 @@ def _entries(family: Family, metric: str) -> list[dict[str, Any]]:
     return entries
 
 
-def _blank(run: str, other: dict[str, Any]) -> dict[str, Any]:
-    """Give the entry of a metric that the run's model does not have, beside that of another."""
-    own = next(iter(read_record(run).values()))  # every entry has the parameters
-    nothing = {"mean": math.nan, "standard_error": math.nan, "per_step": {"mean": math.nan}}
-    return other | nothing | {"parameters": own["parameters"]}
+def _blank(other: dict[str, Any]) -> dict[str, Any]:
+    """Give the entry of a metric that a run's model does not have, beside that of another."""
+    return other | {"mean": math.nan, "standard_error": math.nan, "per_step": {"mean": math.nan}}
 
 
 def _require_same_data(
@@ -99,10 +101,14 @@ def _require_same_data(
 
 
 def _row(family: Family, metric: str, seed: int, entry: dict[str, Any]) -> dict[str, Any]:
-    measured = {name: entry[name] for name in ("mean", "standard_error", "parameters", "sequences")}
-    per_step = entry["per_step"]["mean"]
-    return {"family": family.name, "metric": metric, "seed": seed, **measured, "per_step": per_step} | {
-        "run": family.runs[seed]
+    return {
+        "family": family.name,
+        "metric": metric,
+        "seed": seed,
+        **{name: entry[name] for name in ("mean", "standard_error", "sequences")},
+        "per_step": entry["per_step"]["mean"],
+        "parameters": family.parameters,
+        "run": family.runs[seed],
     }
 
 
@@ -121,7 +127,7 @@ def markdown(comparison: Comparison, families: Sequence[Family]) -> str:
     scores = comparison.scores.set_index(["metric", "family"]).sort_index()
     metrics = comparison.scores["metric"].unique()
     names = [family.name for family in families]
-    parameters = [f"{scores.loc[[(metrics[0], name)], 'parameters'].iloc[0]:,}" for name in names]
+    parameters = [f"{family.parameters:,}" for family in families]
     lines = ["Nats per sequence, mean over seeds [lowest, highest]; ess as a share of K.", ""]
     lines += _table(["metric", *names], [["parameters", *parameters]])
     for metric in metrics:
@@ -135,6 +141,12 @@ def markdown(comparison: Comparison, families: Sequence[Family]) -> str:
         for metric in comparison.differences["metric"].unique():
             each = [_difference(differences, (metric, *pair)) for pair in pairs]
             lines += _rows([[f"`{metric}`", *each]])
+    for metric, of_families in comparison.curves.items():
+        if score_of(metric) == "degradation":
+            rows = at_horizons(metric, of_families)
+            lines += ["", f"`{metric}`: nats a prediction loses so many steps after the last one seen.", ""]
+            lines += _table(["steps", *map(str, next(iter(rows.values())))], [])
+            lines += _rows([[name, *(f"{loss:.2f}" for loss in row.values())] for name, row in rows.items()])
     return "\n".join(lines) + "\n"
 
 

@@ -24,14 +24,13 @@ __all__ = ["describe", "read_arrays", "read_record", "write_record"]
 
 def describe(scores: Scores, metric: str) -> dict[str, Any]:
     """Describe the metric over sequences: the entry of `evaluation.json`, all in nats."""
-    values, steps = scores.values[metric], scores.steps
-    total = values.sum(1)  # (N,)
+    values, steps, total = scores.values[metric], scores.steps, scores.total(metric)
     shares = {"minimum": 0.0, "5%": 0.05, "median": 0.5, "95%": 0.95, "maximum": 1.0}
     counts = scores.mask.sum(0)  # (T,)
     return {
         **Estimate.of(total)._asdict(),
         "interval_95": bootstrap_interval(total),
-        "per_step": Estimate.per_step(total, steps)._asdict(),
+        "per_step": Estimate.per_step(values.sum(1), steps)._asdict(),
         "curve": (values.sum(0) / counts.clamp(min=1)).tolist(),
         "quantiles": {name: total.quantile(share).item() for name, share in shares.items()},
         "sequences": len(total),

@@ -38,6 +38,8 @@ class Pass(NamedTuple):
     """Of a model that has at least one of the metrics, and a batch."""
     batch_size: int
     """Sequences at a time."""
+    context: int = 0
+    """Steps at the beginning that are seen and not scored."""
 
     def of(self, model: BeliefModel) -> "Pass":
         """Leave the bounds out for a model without a posterior: its likelihood is exact, and `pll` gives it."""
@@ -51,12 +53,17 @@ class Scores(NamedTuple):
     values: Increments
     """By metric, what each step adds, 0 on padding, `(N, T)`."""
     mask: Tensor
-    """True where the step counts, `(N, T)`."""
+    """True where the step counts: neither padding nor context, `(N, T)`."""
 
     @property
     def steps(self) -> Tensor:
-        """Steps of each sequence without padding, `(N,)`."""
+        """Steps of each sequence that count, `(N,)`."""
         return self.mask.sum(1)
+
+    def total(self, metric: str) -> Tensor:
+        """Give each sequence's score, `(N,)`: the sum over its steps, of the effective sample size the mean."""
+        total = self.values[metric].sum(1)
+        return total / self.steps if metric == "ess" else total
 
 
 PASSES = ("elbo", "pll", "fivo", "open-loop")
@@ -84,7 +91,7 @@ def make_pass(name: str, number: int, batch_size: int, context: int) -> Pass:
         rows = max(1, _FIVO_ROWS * batch_size // number)
         return Pass(("fivo", "ess"), f"K={number}", partial(score_particles, number=number), rows)
     metrics, function = ("open_loop", "open_loop_marginal"), partial(score_open_loop, number=number, context=context)
-    return Pass(metrics, f"K={number},c={context}", function, batch_size)
+    return Pass(metrics, f"K={number},c={context}", function, batch_size, context)
 
 
 _EXACT_ROWS = 20  # sequences; a belief on a fine grid is 3 MB each
@@ -168,7 +175,9 @@ def score_split(
                 require_finite(where, first, values)
                 if parts:
                     parts.write(first, values)
-            found.append(Scores(values, batch.mask))
+            counts = batch.mask.clone()  # (B, T)
+            counts[:, : score.context] = False
+            found.append(Scores(values, counts))
     merged = {name: torch.cat([scores.values[name] for scores in found]) for name in score.metrics}  # (N, T)
     return Scores(merged, torch.cat([scores.mask for scores in found]))
 

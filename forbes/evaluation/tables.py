@@ -9,10 +9,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from forbes.evaluation.degradation import at_horizons, degradation
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.measured import Measured, Pair
 
-__all__ = ["print_pairs", "print_runs"]
+__all__ = ["print_degradation", "print_pairs", "print_runs"]
 
 
 def print_runs(measured: Sequence[Measured]) -> None:
@@ -42,6 +43,23 @@ def print_pairs(pairs: Sequence[Pair]) -> None:
         cells = [_difference(differences[name]) if name in differences else "n/a" for name in names]
         table.add_row(escape(first.run.path), escape(second.run.path), *cells)
     _console().print(table)
+
+
+def print_degradation(measured: Sequence[Measured]) -> None:
+    """Print what the open loop loses to the closed one, for every run that has both scores."""
+    curves: dict[str, dict[str, list[float]]] = {}
+    for one in measured:
+        for name, entry in one.entries.items():
+            curves.setdefault(name, {})[one.run.path] = entry["curve"]
+    for metric, of_runs in degradation(curves).items():
+        rows = at_horizons(metric, of_runs)
+        table = Table(title=f"{escape(metric)}: nats a prediction loses so many steps after the last one seen")
+        table.add_column("run", overflow="fold")
+        for horizon in next(iter(rows.values())):
+            table.add_column(str(horizon), justify="right")
+        for path, row in rows.items():
+            table.add_row(escape(path), *(f"{loss:.2f}" for loss in row.values()))
+        _console().print(table)
 
 
 def _console() -> Console:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import yaml
 from rich.console import Console
 from rich.markdown import Markdown
 
@@ -17,6 +18,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.commands import add_score_options, evaluate, wanted_metrics
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record
+from forbes.evaluation.runs import load_runs
 from forbes.figures.comparison import differences, per_step, scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
@@ -41,16 +43,22 @@ def main(argv: Sequence[str]) -> None:
     cut = argv.index("--") if "--" in argv else len(argv)
     args, flags = _parser().parse_args(argv[:cut]), list(argv[cut + 1 :])
     command = shlex.join(["forbes", "compare", *argv])
-    families = _families(args.configs, args.seeds, args.output)
-    for config, family in zip(args.configs, families, strict=True):
-        for seed, run in family.runs.items():
+    folders = _run_folders(args.configs, args.seeds, args.output)
+    for config, of_config in zip(args.configs, folders.values(), strict=True):
+        for seed, run in of_config.items():
             _fit(config, seed, run, flags)
-    wanted = wanted_metrics([family.runs[0] for family in families], args)
+    loaded = load_runs([of_config[0] for of_config in folders.values()])
+    wanted = wanted_metrics(loaded, args)
     families = [
-        family._replace(lacks=[metric for metric, has in of_family.items() if not has])
-        for family, of_family in zip(families, wanted, strict=True)
+        Family(name, folders[name], run.parameters, [metric for metric, has in metrics.items() if not has])
+        for name, run, metrics in zip(folders, loaded, wanted, strict=True)
     ]
-    missing = [run for family in families for run in family.runs.values() if not _is_measured(run, family, wanted[0])]
+    missing = [
+        run
+        for family, metrics in zip(families, wanted, strict=True)
+        for run in family.runs.values()
+        if not _is_measured(run, [metric for metric, has in metrics.items() if has], args.seed)
+    ]
     if missing:
         evaluate(missing, args, command)
     comparison = compare(families, [metric for metric in wanted[0] if any(has[metric] for has in wanted)])
@@ -69,29 +77,66 @@ def _parser() -> ArgumentParser:
     return parser
 
 
-def _families(configs: Sequence[str], seeds: int, folder: Path) -> list[Family]:
-    """Name each configuration after its file, with its runs."""
+def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, dict[int, str]]:
+    """Name each configuration after its file, and its runs by seed."""
     names = [Path(config).stem for config in configs]
     for config, name in zip(configs, names, strict=True):
         if not Path(config).is_file():
             raise ForbesError(f"{config}: no such configuration. Name a YAML file, e.g. configs/strokes/forbes.yaml")
         if names.count(name) > 1:
             raise ForbesError(f"{config}: another configuration is called {name} too. Give the files different names")
-    return [Family(name, {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)}) for name in names]
+    return {name: {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)} for name in names}
 
 
 def _fit(config: str, seed: int, run: str, flags: Sequence[str]) -> None:
     """Train a run to its end; one that has been trained is left at once by `forbes fit --resume`."""
     print(f"training {run}", flush=True)
+    arguments = ["--config", config, *flags, "--seed_everything", str(seed)]
     if RunFolder(run).checkpoint.exists():
-        arguments = ["--resume", run]
+        _require_same_configuration(run, arguments)
+        status = _forbes_fit(["--resume", run])
     else:
-        arguments = ["--config", config, *flags, "--seed_everything", str(seed), "--run_dir", run]
-    status = _forbes_fit(arguments)
+        status = _forbes_fit([*arguments, "--run_dir", run])
     if status != 0:
         raise ForbesError(
             f"{run}: its training ended with status {status}. Mend that, then give the same command again"
         )
+
+
+def _require_same_configuration(run: str, arguments: Sequence[str]) -> None:
+    """Refuse a run that was trained otherwise: unequal updates, say, would be compared unseen.
+
+    Callbacks do not count, since they watch; nor do keys that the run's version of this package did not have.
+    """
+    asked, own = (
+        _flat(yaml.safe_load(text)) for text in (_configuration(arguments), RunFolder(run).config.read_text())
+    )
+    for key in asked:
+        if key in own and own[key] != asked[key] and key != "trainer.callbacks":
+            raise ForbesError(
+                f"{run}: was trained with {key} = {own[key]}, expected {asked[key]}. Give the configuration and flags "
+                "it had, or another folder, -o"
+            )
+
+
+def _flat(section: Any, name: str = "") -> dict[str, Any]:
+    """Name every value by the keys that lead to it: `model.init_args.state_dim`."""
+    if not isinstance(section, dict):
+        return {name: section}
+    return {k: v for key, value in section.items() for k, v in _flat(value, f"{name}.{key}".strip(".")).items()}
+
+
+def _configuration(arguments: Sequence[str]) -> str:
+    """Ask `forbes fit` for the whole configuration it would train by."""
+    asked = subprocess.run(
+        [sys.executable, "-m", "forbes", "fit", *arguments, "--print_config"],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    if asked.returncode != 0:
+        raise ForbesError(f"{shlex.join(arguments)}: `forbes fit` cannot train by that (above). Mend it")
+    return asked.stdout
 
 
 def _forbes_fit(arguments: Sequence[str]) -> int:
@@ -99,11 +144,11 @@ def _forbes_fit(arguments: Sequence[str]) -> int:
     return subprocess.run([sys.executable, "-m", "forbes", "fit", *arguments], check=False).returncode
 
 
-def _is_measured(run: str, family: Family, metrics: Iterable[str]) -> bool:
-    """Tell whether every metric that the family has is recorded of the run's present checkpoint."""
+def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:
+    """Tell whether every metric is recorded of the run's present checkpoint, with this seed of the noise."""
     record, checkpoint = read_record(run), RunFolder(run).checkpoint_sha256()
-    wanted = [metric for metric in metrics if metric not in family.lacks]
-    return all(metric in record and record[metric]["checkpoint"] == checkpoint for metric in wanted)
+    entries = [record.get(metric, {}) for metric in metrics]
+    return all(entry.get("checkpoint") == checkpoint and entry["seed"] == seed for entry in entries)
 
 
 def _write(comparison: Comparison, families: Sequence[Family], folder: Path, command: str) -> None:
@@ -114,7 +159,9 @@ def _write(comparison: Comparison, families: Sequence[Family], folder: Path, com
     replace_file(folder / "comparison.csv", comparison.scores.to_csv(index=False).encode())
     replace_file(folder / "comparison.json", (json.dumps(record, indent=2) + "\n").encode())
     replace_file(folder / "comparison.md", text.encode())
-    figures = {"scores": scores(comparison), "per-step": per_step(comparison)}
+    figures = {"scores": scores(comparison)}
+    if steps := per_step(comparison):
+        figures["per-step"] = steps
     if len(comparison.differences):
         figures["differences"] = differences(comparison, families[0].name)
     for name, figure in figures.items():

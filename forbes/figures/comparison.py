@@ -13,7 +13,7 @@ from forbes.figures.style import PAGE, PALETTE, paper_style
 
 __all__ = ["differences", "per_step", "scores"]
 
-_PER_STEP = ("elbo", "pll", "open_loop_marginal")
+_PER_STEP = ("elbo", "pll", "open_loop_marginal", "degradation", "ess")
 """Scores whose value at a step means something by itself."""
 
 
@@ -48,17 +48,22 @@ def scores(comparison: Comparison) -> Figure:
     return figure
 
 
-def per_step(comparison: Comparison) -> Figure:
-    """Draw the mean of each step over sequences and seeds, a panel for each score that has one."""
+def per_step(comparison: Comparison) -> Figure | None:
+    """Draw the mean of each step over sequences and seeds, a panel for each score that has one; None without any."""
     metrics = [metric for metric in comparison.curves if score_of(metric) in _PER_STEP]
+    if not metrics:
+        return None
+    columns = min(3, len(metrics))
+    rows = math.ceil(len(metrics) / columns)
     colours = dict(zip(comparison.scores["family"].unique(), cycle(PALETTE), strict=False))
     with paper_style():
-        figure = Figure((PAGE, 2.6), layout="constrained")
-        panels = figure.subplots(1, len(metrics), squeeze=False)[0]
-        for axes, metric in zip(panels, metrics, strict=True):
+        figure = Figure((PAGE, 2.4 * rows + 0.2), layout="constrained")
+        panels = figure.subplots(rows, columns, squeeze=False).flat
+        for axes, metric in zip(panels, metrics, strict=False):
             _draw_steps(axes, comparison.curves[metric], metric, colours)
-        panels[0].set_ylabel("nats per step")
-        lines = {line.get_label(): line for axes in panels for line in axes.lines}  # not every family is in each panel
+        for axes in panels[len(metrics) :]:
+            axes.remove()
+        lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}  # some lack some families
         named = {name: lines[name] for name in colours if name in lines}
         figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=4)
     return figure
@@ -71,6 +76,7 @@ def _draw_steps(axes: Axes, curves: dict[str, list[float]], metric: str, colours
         axes.plot(steps[shown], np.asarray(curve)[shown], color=colours[name], label=name)
     axes.set_title(_in_lines(metric))
     axes.set_xlabel("step")
+    axes.set_ylabel("share of K" if score_of(metric) == "ess" else "nats")
 
 
 def differences(comparison: Comparison, first: str) -> Figure:

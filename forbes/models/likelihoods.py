@@ -83,7 +83,8 @@ class Normal(Likelihood):
         if not 1 <= bits <= 8 or (bits < 8 and scale != 255):
             raise ForbesError(f"Normal: bits is {bits} at scale {scale:g}, expected 1 to 8 of bytes, scale 255")
         self.std, self.scale, self.bits = std, scale, bits
-        self.name = f"normal({std:g})" if bits == 8 else f"normal({std:g},bits={bits})"
+        own = [f"scale={scale:g}"] * (scale != 255) + [f"bits={bits}"] * (bits != 8)
+        self.name = f"normal({','.join([f'{std:g}', *own])})"
 
     def target(self, observation: Tensor) -> Tensor:
         """See `Likelihood.target`: values in [-1/2, 1/2]."""

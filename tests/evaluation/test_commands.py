@@ -113,9 +113,14 @@ def test_every_score_is_measured_by_default_and_named_with_its_numbers(runs, cap
     entries = record(runs[0])
     assert list(entries) == [f"test[:5]/{name}" for name in names]
     assert [name for name in entries if "paired" in entries[name]] == [f"test[:5]/{names[i]}" for i in (0, 3, 4, 5, 7)]
-    assert 1 / 3 <= entries["test[:5]/ess[bernoulli,K=3]"]["per_step"]["mean"] <= 1
-    assert not any(entries["test[:5]/open_loop[bernoulli,K=4,c=2]"]["curve"][:2])
+    ess = entries["test[:5]/ess[bernoulli,K=3]"]
+    assert all(1 / 3 <= share <= 1 for share in (ess["mean"], ess["per_step"]["mean"], *ess["interval_95"]))
+    open_loop, elbo = (entries[f"test[:5]/{name}"] for name in ("open_loop[bernoulli,K=4,c=2]", "elbo[bernoulli,S=2]"))
+    assert not any(open_loop["curve"][:2])
+    assert open_loop["steps"] == elbo["steps"] - 5 * 2
+    assert open_loop["per_step"]["mean"] == pytest.approx(5 * open_loop["mean"] / open_loop["steps"])
     out = capsys.readouterr().out
+    assert "test[:5]/degradation[bernoulli,K=4,c=2]" in out
     assert all(name in out for name in ("elbo", "iwae", "pll", "fivo", "open_loop", "[bernoulli,K=4,c=2]"))
 
 
@@ -286,7 +291,9 @@ def test_wrong_arguments_are_named(runs, tmp_path, capsys):
     assert "at least 2" in error_of(capsys, runs[0], "--digits", "1")
     assert "the test split" in error_of(capsys, runs[0], "--digits", "13")
     assert "--digits" in error_of(capsys, runs[0], "--digits", "most")
-    assert "have 6 steps" in error_of(capsys, runs[0], "--scores", "open-loop", "--context", "6")
+    short = error_of(capsys, runs[0], "--scores", "open-loop", "--context", "5")
+    assert "--context 5: sequence 2 of the test split" in short
+    assert "has 5 steps, expected more. Choose a smaller context" in short
     assert "invalid choice: 'bleu'" in error_of(capsys, runs[0], "--scores", "bleu")
     assert "--device moon" in error_of(capsys, runs[0], "--device", "moon")
     assert "no such run folder" in error_of(capsys, str(tmp_path / "nowhere"))

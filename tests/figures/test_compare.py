@@ -1,5 +1,7 @@
 """`forbes compare`: trains, measures and puts side by side; interrupted, it goes on."""
 
+import contextlib
+import io
 import json
 import shutil
 from pathlib import Path
@@ -9,19 +11,34 @@ import pandas as pd
 import pytest
 
 from forbes.cli import main
-from forbes.evaluation.comparison import Comparison, Family, compare
+from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.measured import score_of
-from forbes.evaluation.record import read_arrays
+from forbes.evaluation.record import read_arrays, read_record
 from forbes.figures import compare_command
 from forbes.figures.comparison import differences, per_step, scores
 
 ELBO = "test/elbo[bernoulli,S=2]"
+ONE_EPOCH = ["--", "--trainer.max_epochs", "1"]
 MEASURES = ["--samples", "2", "--particles", "2", "--futures", "2", "--context", "2"]
 
 
 def in_this_process(arguments):
-    """A process of its own would spend most of the test on its imports."""
     return main(["fit", *arguments])
+
+
+def configuration_in_this_process(arguments):
+    with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit, match="0"):
+        main(["fit", *arguments, "--print_config"])
+    return printed.getvalue()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_process():
+    """A process of its own would spend most of a test on its imports."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compare_command, "_forbes_fit", in_this_process)
+        patch.setattr(compare_command, "_configuration", configuration_in_this_process)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -40,15 +57,13 @@ def compared(configs, tmp_path_factory):
     """The folder of a comparison of two families with two seeds each."""
     folder = tmp_path_factory.mktemp("compared")
     arguments = ["compare", *configs, "--seeds", "2", "-o", str(folder), *MEASURES]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compare_command, "_forbes_fit", in_this_process)
-        assert main([*arguments, "--", "--trainer.max_epochs", "1"]) == 0
+    assert main([*arguments, *ONE_EPOCH]) == 0
     return folder
 
 
 @pytest.fixture(scope="module")
 def families(compared):
-    return [Family(name, {seed: str(compared / f"{name}-{seed}") for seed in range(2)}) for name in ("rssm", "forbes")]
+    return [Family(n, {seed: str(compared / f"{n}-{seed}") for seed in range(2)}, 9) for n in ("rssm", "forbes")]
 
 
 def test_every_configuration_is_trained_under_every_seed_with_the_flags(compared):
@@ -91,15 +106,20 @@ def test_the_pictures_are_there_and_show_the_values(compared, families):
     assert panel.texts[0].get_text() == f"{comparison.differences['mean'].mean():+.2f}"
 
 
-def test_a_score_that_a_family_does_not_have_is_empty_in_tables_and_pictures(configs, compared, tmp_path, monkeypatch):
-    vector = tmp_path / "vector.yaml"
+@pytest.fixture(scope="module")
+def vector(configs, tmp_path_factory):
+    """The configuration of a model without bounds."""
+    path = tmp_path_factory.mktemp("configs") / "vector.yaml"
     flows = "{class_path: FlowBelief, init_args: {layers: 2, width: 4}}"
     text = Path(configs[1]).read_text().replace(f"belief: {flows}", "model: VectorModel")
-    vector.write_text(text.replace("state_dim: 2", "state_dim: 0"))
-    folder = shutil.copytree(compared, tmp_path / "compared")
-    monkeypatch.setattr(compare_command, "_forbes_fit", in_this_process)
+    path.write_text(text.replace("state_dim: 2", "state_dim: 0"))
+    return str(path)
 
-    assert main(["compare", str(vector), *configs, "-o", str(folder), *MEASURES]) == 0
+
+def test_a_score_that_a_family_does_not_have_is_empty(configs, vector, compared, tmp_path):
+    folder = shutil.copytree(compared, tmp_path / "compared")
+
+    assert main(["compare", vector, *configs, "-o", str(folder), *MEASURES, *ONE_EPOCH]) == 0
 
     table = pd.read_csv(folder / "comparison.csv").set_index(["metric", "family"])
     pll = next(name for name in table.index.levels[0] if "/pll[" in name)
@@ -116,8 +136,7 @@ def test_a_score_that_a_family_does_not_have_is_empty_in_tables_and_pictures(con
     assert "n/a" not in rows[pll]
     assert {score_of(row["metric"]) for row in record["differences"]} == {"pll", "open_loop"}
 
-    families = [Family(name, {0: str(folder / f"{name}-0")}) for name in ("rssm", "vector")]
-    families[1] = families[1]._replace(lacks=[ELBO])
+    families = [Family(n, {0: str(folder / f"{n}-0")}, 9, lacks) for n, lacks in [("rssm", []), ("vector", [ELBO])]]
     comparison = compare(families, [ELBO, pll])
     elbo, of_pll = per_step(comparison).axes
     assert [line.get_label() for line in elbo.lines] == ["rssm"]
@@ -137,14 +156,96 @@ def test_a_difference_that_two_families_do_not_have_says_so():
 
 def test_given_again_it_trains_and_measures_nothing(configs, compared, monkeypatch, capfd):
     measured = []
-    monkeypatch.setattr(compare_command, "_forbes_fit", in_this_process)
     monkeypatch.setattr(compare_command, "evaluate", lambda *arguments: measured.append(arguments))
     before = {path: path.read_bytes() for path in compared.rglob("evaluation.json")}
 
-    assert main(["compare", *configs, "--seeds", "2", "-o", str(compared), *MEASURES]) == 0
+    assert main(["compare", *configs, "--seeds", "2", "-o", str(compared), *MEASURES, *ONE_EPOCH]) == 0
 
     assert measured == []
     assert {path: path.read_bytes() for path in compared.rglob("evaluation.json")} == before
+
+
+def test_other_noise_is_measured_anew(configs, compared, tmp_path):
+    folder = shutil.copytree(compared, tmp_path / "compared")
+    command = ["compare", *configs, "--scores", "elbo", "-o", str(folder), *MEASURES, "--seed", "1", *ONE_EPOCH]
+
+    assert main(command) == 0
+
+    for run, other in [(folder / "rssm-0", compared / "rssm-0"), (folder / "forbes-0", compared / "forbes-0")]:
+        assert json.loads((run / "evaluation.json").read_text())[ELBO]["seed"] == 1
+        assert not np.array_equal(read_arrays(str(run))[ELBO], read_arrays(str(other))[ELBO])
+
+
+def test_it_goes_on_where_it_was_stopped(configs, tmp_path, monkeypatch):
+    """Killed in the second training, then between the measurement of one run and that of another."""
+    command = ["compare", *configs, "--scores", "elbo", "-o", str(tmp_path), *MEASURES, *ONE_EPOCH]
+    fits, measure = [], compare_command.evaluate
+
+    def killed_in_the_second(arguments):
+        fits.append(arguments)
+        return in_this_process(arguments) if len(fits) == 1 else 143
+
+    monkeypatch.setattr(compare_command, "_forbes_fit", killed_in_the_second)
+    assert main(command) == 2
+    monkeypatch.setattr(compare_command, "_forbes_fit", in_this_process)
+    monkeypatch.setattr(compare_command, "evaluate", lambda runs, *rest: measure(runs[:1], *rest) and 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(command)
+    measured = []
+    monkeypatch.setattr(compare_command, "evaluate", lambda runs, *rest: measured.append(runs) or measure(runs, *rest))
+
+    assert main(command) == 0
+
+    assert measured == [[str(tmp_path / "forbes-0")]]
+    assert len((tmp_path / "comparison.md").read_text().splitlines()) > 4
+    for name in ("rssm", "forbes"):
+        metrics = (tmp_path / f"{name}-0" / "metrics.jsonl").read_text().splitlines()
+        assert json.loads(metrics[-1])["update"] == 5
+
+
+@pytest.mark.parametrize("scores", [["elbo"], ["fivo"]])
+def test_a_family_without_any_of_the_scores_has_a_row_of_its_own(scores, configs, vector, compared, tmp_path, capsys):
+    folder = shutil.copytree(compared, tmp_path / "compared")
+
+    assert main(["compare", configs[0], vector, "-o", str(folder), "--scores", *scores, *MEASURES, *ONE_EPOCH]) == 0
+
+    table = pd.read_csv(folder / "comparison.csv").set_index("family")
+    assert table.loc["vector", "mean"].isna().all()
+    assert table.loc["rssm", "mean"].notna().all()
+    assert (table.loc["vector", "parameters"] > 0).all()
+    assert (folder / "per-step.png").exists()
+
+
+def test_the_degradation_is_what_the_open_loop_loses_step_by_step(compared, families):
+    metrics = list(pd.read_csv(compared / "comparison.csv")["metric"].unique())
+
+    comparison = compare(families, metrics)
+
+    (degradation,) = [metric for metric in comparison.curves if score_of(metric) == "degradation"]
+    pll, marginal = (
+        next(metric for metric in metrics if score_of(metric) == name) for name in ("pll", "open_loop_marginal")
+    )
+    for name in ("rssm", "forbes"):
+        records = [read_record(run) for run in runs_of(families, name)]
+        closed, opened = (np.mean([record[metric]["curve"] for record in records], 0) for metric in (pll, marginal))
+        expected = np.where(np.arange(len(closed)) < 2, 0, closed - opened)
+        assert comparison.curves[degradation][name] == pytest.approx(expected.tolist())
+    text = markdown(comparison, families)
+    assert f"`{degradation}`" in text
+    assert f"| forbes | {comparison.curves[degradation]['forbes'][2]:.2f} |" in text
+    assert len(per_step(comparison).axes) == 5
+
+
+def runs_of(families, name):
+    return next(family for family in families if family.name == name).runs.values()
+
+
+def test_a_run_that_was_trained_otherwise_is_refused(configs, compared, capsys):
+
+    assert main(["compare", *configs, "-o", str(compared), *MEASURES]) == 2
+
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "rssm-0: was trained with trainer.max_epochs = 1, expected 2. Give the configuration" in error
 
 
 def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_path, capsys):

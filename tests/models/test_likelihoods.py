@@ -46,7 +46,13 @@ def test_normal_centres_stored_values_on_zero(scale):
 
 
 @pytest.mark.parametrize(
-    ("likelihood", "name"), [(Bernoulli(), "bernoulli"), (Normal(), "normal(1)"), (Normal(0.5), "normal(0.5)")]
+    ("likelihood", "name"),
+    [
+        (Bernoulli(), "bernoulli"),
+        (Normal(), "normal(1)"),
+        (Normal(0.5), "normal(0.5)"),
+        (Normal(scale=1), "normal(1,scale=1)"),
+    ],
 )
 def test_name_tells_the_densities_apart(likelihood, name):
     assert likelihood.name == name
