@@ -1,11 +1,13 @@
-"""A clean stop: Ctrl-C and SIGTERM end a training after the update at hand, with a checkpoint to go on from."""
+"""A clean stop: Ctrl-C and SIGTERM end a training where it can go on, with a checkpoint to go on from."""
 
+import os
 import signal
 from types import FrameType
 
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from forbes.data import Experience
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["StopOnSignal"]
@@ -13,6 +15,9 @@ __all__ = ["StopOnSignal"]
 
 class StopOnSignal(Callback):
     """Stops a training at the first SIGINT or SIGTERM as soon as its state is whole; at the second at once.
+
+    That is after the update at hand; for an agent, whose epoch begins with an episode that a resumed one would lack,
+    after the epoch.
 
     Left alone, Lightning breaks off in the middle of an update at Ctrl-C, and saves nothing at either signal.
 
@@ -32,12 +37,13 @@ class StopOnSignal(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Take the place of Lightning's handler, which it puts back itself after the training."""
         self._end_loop = signal.getsignal(signal.SIGTERM)
+        self._whole_epochs = isinstance(trainer.datamodule.source, Experience)  # type: ignore[attr-defined]
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._receive)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         """End the loop after this update, unless a validation follows, which must not be left half done."""
-        if not trainer.is_last_batch:
+        if not trainer.is_last_batch and not self._whole_epochs:
             self._end()
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -53,6 +59,8 @@ class StopOnSignal(Callback):
         if self.received is not None:
             raise SystemExit(128 + number)
         self.received = number
+        if self._whole_epochs:  # which may take minutes; print could be what was interrupted
+            os.write(2, b"\nstopping after this epoch; once more to stop at once, and lose it\n")
 
     def _end(self) -> None:
         if self.received is not None and callable(self._end_loop):

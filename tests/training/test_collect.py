@@ -1,6 +1,8 @@
 """An agent that plays while it learns, through the command line: what is stored, counted, measured and resumed."""
 
+import os
 import shutil
+import signal
 
 import numpy as np
 import pandas as pd
@@ -175,6 +177,35 @@ def test_overlapped_episodes_are_one_epoch_older_and_resume_to_the_same_numbers(
     np.testing.assert_array_equal(actions[0], actions[1])
     np.testing.assert_array_equal(actions[0][:2], actions[2][:2])
     assert (actions[0][2] != actions[2][2]).any()  # without, the first epoch's updates come before it is played
+
+
+@pytest.mark.parametrize("overlap", ["", ", overlap: true"], ids=["in turns", "overlap"])
+@pytest.mark.parametrize("update", [0, 5, 7])
+def test_a_signal_ends_the_training_with_the_epoch_and_nothing_is_missing(
+    tmp_path, monkeypatch, capfd, overlap, update
+):
+    """At the first update, in the midst of the second epoch, and at the last of it; resumed, nothing is missing."""
+
+    def interrupt(self, loss):
+        if self.global_step == update:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    text = write_config(tmp_path).read_text().replace("seed_episodes: 2", f"seed_episodes: 2{overlap}")
+    (tmp_path / "agent.yaml").write_text(text)
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    assert fit("--config", tmp_path / "agent.yaml", "--run_dir", whole) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(ImaginationActorCritic, "on_before_backward", interrupt)
+        assert fit("--config", tmp_path / "agent.yaml", "--run_dir", stopped) == 130
+    said = capfd.readouterr()
+    assert "stopping after this epoch" in said.err
+    assert f"stopped at update {4 * (update // 4 + 1)}" in said.out
+
+    assert fit("--resume", stopped) == 0
+
+    pd.testing.assert_frame_equal(read_metrics(stopped), read_metrics(whole), check_exact=True)
+    state, expected = (read_checkpoint(RunFolder(path).checkpoint)["state_dict"] for path in (stopped, whole))
+    torch.testing.assert_close(state, expected, rtol=0, atol=0)
 
 
 def test_a_finished_run_can_be_made_longer(run, tmp_path):
