@@ -83,6 +83,27 @@ class Troubled(Echo):
         return step._replace(observation=np.zeros(2))
 
 
+class Weary(Troubled):
+    """Goes wrong in three episodes in a row, after so many healthy ones; `ledger` counts them all."""
+
+    def __init__(self, trouble, ledger, healthy):
+        super().__init__(trouble, ledger)
+        self.healthy = healthy
+
+    def reset(self, seed):
+        with self.ledger.open("a") as file:
+            file.write("x")
+        return super().reset(seed)
+
+    def step(self, action):
+        step = Echo.step(self, action)
+        ill = self.time == 3 and self.healthy < self.count() <= self.healthy + 3
+        return getattr(self, self.trouble)(step) if ill else step
+
+    def describe(self):
+        return {"task": "Weary"}
+
+
 class Pictures(Environment):
     """A white square that moves to the right; its column is the time."""
 

@@ -109,6 +109,16 @@ class Experience(SequenceSource):
         self._look()
         return record
 
+    def begun(self, policy: str, seed: int, most: int) -> int:
+        """Count the first episodes, of at most so many, that `collect` with these arguments would play again."""
+        count = 0
+        for record in self._open().records.values():
+            same = record.policy == policy and record.seed == episode_seed(seed, count) and record.number == count
+            if not same or count == most:
+                break
+            count += 1
+        return count
+
     @property
     def newest(self) -> EpisodeRecord:
         """The record of the latest episode that is there."""

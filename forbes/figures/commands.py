@@ -95,7 +95,8 @@ def _agents(runs: Sequence[str]) -> tuple[str, dict[str, list[pd.Series]]]:
         source = yaml.safe_load(RunFolder(run).config.read_text())["data"]["init_args"]["source"]
         tasks.add(source["init_args"]["task"])
         name = re.sub(r"-\d+$", "", Path(run).absolute().name)
-        curves.setdefault(name, []).append(metrics.set_index("env_steps")["return/acting"].dropna())
+        measured = metrics[["env_steps", "return/acting"]].dropna()
+        curves.setdefault(name, []).append(measured.set_index("env_steps")["return/acting"])
     if len(tasks) > 1:
         raise ForbesError(f"--runs: they are of {' and '.join(sorted(tasks))}, expected one task. Draw each by itself")
     return tasks.pop(), curves

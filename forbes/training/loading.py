@@ -98,7 +98,8 @@ def check_weights(model: nn.Module, state: Mapping[str, Tensor], name: str) -> N
         elif key not in own:
             problem = f"its {key} is not in the configured model: another belief family"
         elif own[key].shape != state[key].shape:
-            problem = f"its {key} is {tuple(state[key].shape)}, that of the configured model {tuple(own[key].shape)}"
+            shapes = f"{tuple(state[key].shape)}, that of the configured model {tuple(own[key].shape)}"
+            problem = f"its {key} is {shapes}: other sizes, or observations or actions of another shape"
         else:
             continue
         raise ForbesError(f"{name}: {problem}. Use it with the configuration it was trained with")

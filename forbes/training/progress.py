@@ -22,9 +22,7 @@ class TerminalProgress(RichProgressBar):
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """Give what the bar shows at its right."""
-        return {
-            name: round(value, 1 if abs(value) >= 100 else 3) for name, value in _objectives(trainer, pl_module).items()
-        }
+        return dict(_objectives(trainer, pl_module))
 
 
 class PlainProgress(ProgressBar):
@@ -65,18 +63,24 @@ class PlainProgress(ProgressBar):
             f"update {trainer.global_step}" + f"/{total}" * ends,
             str(timedelta(seconds=round(elapsed))),
             f"{rate:.1f} updates/s",
-            *(f"{name} {value:.{1 if abs(value) >= 100 else 3}f}" for name, value in objectives.items()),
+            *(f"{name} {value}" for name, value in objectives.items()),
         ]
         if ends:
             fields.append(f"left {timedelta(seconds=round((total - trainer.global_step) / rate))}")
         print("  ".join(fields), flush=True)
 
 
-def _objectives(trainer: Trainer, module: LightningModule) -> dict[str, float]:
-    """Give the newest bound, or loss in nats per step, of each split, and what an agent earns and foresees."""
+def _objectives(trainer: Trainer, module: LightningModule) -> dict[str, str]:
+    """Give the newest bound, or loss in nats per step, of each split; what an agent has seen, earns and foresees."""
     objective = getattr(module, "objective_name", "loss")  # a module of somebody else's may have none
     return {
-        name: float(value)
+        name: _shown(name, float(value))
         for name, value in trainer.callback_metrics.items()
-        if name.endswith(f"/{objective}") or name.startswith(("return/", "reward_explained/"))
+        if name.endswith(f"/{objective}") or name == "env_steps" or name.startswith(("return/", "reward_explained/"))
     }
+
+
+def _shown(name: str, value: float) -> str:
+    if name == "env_steps":
+        return f"{value:,.0f}"
+    return f"{value:.{1 if abs(value) >= 100 else 3}f}"

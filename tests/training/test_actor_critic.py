@@ -114,6 +114,25 @@ def test_every_parameter_is_in_one_group(continuation):
     assert {id(parameter) for parameter in grouped} == {id(parameter) for parameter in ours.parameters()}
 
 
+def test_each_group_is_clipped_alone():
+    """A gradient far above the norm shrinks to it; those of the other groups stay what they are."""
+    module = agent(clip_norm=1.0)
+    for scale, group in zip((1e3, 1e-3, 1e-4), module.groups(), strict=True):
+        for parameter in group.parameters:
+            parameter.grad = scale * torch.ones_like(parameter)
+    before = [norm_of(group) for group in module.groups()]
+
+    module.configure_gradient_clipping(None)
+
+    after = [norm_of(group) for group in module.groups()]
+    assert before[0] > 1 > max(before[1:])
+    assert after == [pytest.approx(1, rel=1e-4), *before[1:]]
+
+
+def norm_of(group):
+    return torch.stack([parameter.grad.square().sum() for parameter in group.parameters]).sum().sqrt().item()
+
+
 @pytest.mark.parametrize("trajectories", [1, 3])
 def test_a_flow_that_is_the_identity_is_dreamer(trajectories):
     dreamer = agent(kl="monte_carlo", trajectories=trajectories)

@@ -1,5 +1,6 @@
 """An agent that plays while it learns, through the command line: what is stored, counted, measured and resumed."""
 
+import errno
 import os
 import shutil
 import signal
@@ -12,6 +13,7 @@ from small_agents import fit, forbes, write_config
 
 from forbes.data.episode_store import EpisodeStore
 from forbes.evaluation.foresight import foretell, share_explained
+from forbes.files import replace_file
 from forbes.seeding import derive_seed
 from forbes.training import ImaginationActorCritic
 from forbes.training.acting import play_measured
@@ -111,6 +113,77 @@ def test_says_where_episodes_end_and_the_agent_imagines_that_none_does(tmp_path)
 
     assert fit(*parrot, "--model.continuation", "true", "--run_dir", tmp_path / "run") == 0
     assert (read_metrics(tmp_path / "run")["train/continuation"] < 0).sum() == 12  # a log-probability at each update
+
+
+def test_the_progress_counts_env_steps_beside_updates(tmp_path, capsys):
+    assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run") == 0
+
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("epoch ")]
+    assert [line.split("env_steps ")[1].split()[0] for line in lines] == ["48", "72", "96"]
+
+
+def test_a_start_that_left_no_checkpoint_lends_another_only_the_episodes_it_would_play(run, tmp_path, monkeypatch):
+    """Cut off in its first epoch, then begun anew in the same folder: under its seed, then under another."""
+    config = write_config(tmp_path)
+
+    def kill(self, loss):
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ImaginationActorCritic, "on_before_backward", kill)
+        for seed in (1, 1, 0):
+            with pytest.raises(Killed):
+                fit("--config", config, "--run_dir", tmp_path / "run", "--seed_everything", seed)
+            set_aside = tmp_path / "run" / "episodes" / "set_aside"
+            assert len([*set_aside.glob("*.npz")]) == (2 if seed == 0 else 0)
+    assert fit("--config", config, "--run_dir", tmp_path / "run") == 0
+
+    stores = [EpisodeStore(folder / "episodes") for folder in (run, tmp_path / "run")]
+    first, second = ([record.seed for record in store.records.values()] for store in stores)
+    assert first == second
+
+
+@pytest.mark.parametrize(("task", "what"), [("tiger", "observation"), ("mountain_hike", "action")])
+def test_an_environment_of_other_shapes_than_the_checkpoints_is_refused(run, tmp_path, capsys, task, what):
+    """The parrot's observations are 2 numbers and its actions 1; the hike's actions are 2."""
+    other = ("--data.source.task", task, "--data.source.options", "{}")
+
+    assert fit("--resume", shutil.copytree(run, tmp_path / "run"), *other) == 2
+
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "that of the configured model" in error
+    assert f"{what}s" in error.partition(": other sizes, or ")[2]
+    assert len(EpisodeStore(tmp_path / "run" / "episodes").records) == 4
+
+
+@pytest.mark.parametrize("trouble", ["raises", "rewards_nan"])
+def test_an_environment_that_fails_for_good_ends_the_training_and_loses_nothing(tmp_path, capsys, trouble):
+    """In the fourth episode it learns from, after two that measured it; then it is well, and the run goes on."""
+    options = f"{{trouble: {trouble}, ledger: {tmp_path / 'ledger'}, healthy: 5}}"
+    task = ("--data.source.task", "Weary", "--data.source.options", options)
+
+    assert fit("--config", write_config(tmp_path), *task, "--run_dir", tmp_path / "run") == 2
+
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "so broke episode 3 3 times, nothing of it is stored. Mend the environment" in error
+    assert list(EpisodeStore(tmp_path / "run" / "episodes").records) == [0, 1, 2]
+    assert fit("--resume", tmp_path / "run") == 0
+    assert list(EpisodeStore(tmp_path / "run" / "episodes").records) == [0, 1, 2, 3]
+
+
+def test_a_disk_that_is_full_ends_the_training_and_loses_nothing(run, tmp_path, monkeypatch, capsys):
+    def full(path, content):
+        if path.name == "000003.npz":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace_file(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("forbes.data.episode_store.replace_file", full)
+        assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run") == 2
+
+    assert "No space left on device" in capsys.readouterr().err.splitlines()[-1]
+    assert fit("--resume", tmp_path / "run") == 0
+    pd.testing.assert_frame_equal(read_metrics(tmp_path / "run"), read_metrics(run), check_exact=True)
 
 
 class Killed(BaseException):

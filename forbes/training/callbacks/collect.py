@@ -31,7 +31,8 @@ class Collect(Callback):
     the same. The store is the run folder's `episodes/`.
 
     With `overlap`, the episode that epoch e + 1 begins with is played during epoch e, by the agent as it was when e
-    began: always one epoch older than it would be otherwise, and so no less reproducible.
+    began: always one epoch older than it would be otherwise, and so no less reproducible. No other episode is played
+    meanwhile: two processes that render on one GPU may wait for each other for ever.
 
     Logs, at the end of the epoch: `env_steps` (frames of the simulator, action repeat included), `agent_steps`,
     `return/exploring` of the newest episode, and of episodes without exploration, which the agent does not learn from,
@@ -80,18 +81,24 @@ class Collect(Callback):
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play what is missing."""
         source, agent = _experience(trainer), cast(ActingModel, pl_module)
+        if trainer.current_epoch == 0:  # a start that was cut off in its first epoch has left no checkpoint to say so
+            source.watermark = source.begun("random", agent.seed, self.seed_episodes)
         for record in source.collect(self.seed_episodes, random_policy, "random", agent.seed):
             _say(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
         with _eval_mode(agent):
             until = self.seed_episodes + trainer.current_epoch
             list(source.collect(until, Acting(agent, exploring=True), type(agent).__name__, agent.seed))
         _warn_of_ends(source, agent)
-        if self.overlap:
-            source.begin(Acting.as_it_is(agent, exploring=True), agent.seed)
         steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
         if source.newest.number >= self.seed_episodes:
             steps["return/exploring"] = source.newest.total_reward
         agent.log_dict(steps, on_step=False, on_epoch=True, batch_size=1)
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
+        """Let the next episode be played, now that other callbacks have played theirs."""
+        if self.overlap and batch_idx == 0:
+            agent = cast(ActingModel, pl_module)
+            _experience(trainer).begin(Acting.as_it_is(agent, exploring=True), agent.seed)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Store the episode played meanwhile; measure the agent every few epochs, and at the end."""
