@@ -22,8 +22,8 @@ from forbes.errors import ForbesError
 __all__ = ["BrokenEnvironmentError", "EnvironmentProcess", "belong_to_parent"]
 
 START_LIMIT = 180.0
-_UNGUARDED = '. It reads the script that started it anew: keep its commands under `if __name__ == "__main__":`'
 """Seconds to import and build an environment; two tries of a renderer, of 60 each, among them."""
+_UNGUARDED = '. It reads the script that started it anew: keep its commands under `if __name__ == "__main__":`'
 
 
 class BrokenEnvironmentError(ForbesError):

@@ -179,6 +179,24 @@ def test_data_of_a_known_process_add_its_exact_likelihood(tmp_path, capsys):
     assert "log_p" in capsys.readouterr().out
 
 
+PROCESSES = sorted(path.parent.name for path in (Path(__file__).parents[2] / "configs" / "pomdp").glob("*/rssm.yaml"))
+
+
+@pytest.mark.parametrize("process", PROCESSES)
+def test_the_bounds_of_a_trained_model_stand_in_order_below_the_likelihood_of_every_process(process, tmp_path):
+    """Paired over sequences, each difference at least 0 within four standard errors."""
+    config = Path(__file__).parents[2] / "configs" / "pomdp" / process / "rssm.yaml"
+    small = ["--data.length=10", "--data.updates_per_epoch=150", "--trainer.max_epochs=1", "--model.warmup=20"]
+    run = fit(config, tmp_path / "run", *small, "--model.kl_warmup=0", "--data.source.init_args.test=200")
+    numbers = ["--samples", "4", "--particles", "16", "--futures", "2", "--context", "3"]
+    assert main(["evaluate", str(run), "--scores", "elbo", "pll", "fivo", *numbers]) == 0
+
+    scores = {name.partition("/")[2].partition("[")[0]: values for name, values in arrays_of(run).items()}
+    for lower, upper in [("elbo", "iwae"), ("elbo", "fivo"), ("iwae", "log_p"), ("fivo", "log_p"), ("pll", "log_p")]:
+        gap = scores[upper] - scores[lower]
+        assert gap.mean() > -4 * gap.std(ddof=1) / len(gap) ** 0.5, (lower, upper)
+
+
 def test_both_runs_record_the_same_paired_difference(runs, capsys):
     evaluate(*runs)
 
