@@ -15,10 +15,11 @@ from forbes.errors import ForbesError
 from forbes.evaluation.calibration import coverage
 from forbes.evaluation.runs import TrainedRun, load_runs, run_titles
 from forbes.evaluation.self_calibration import SelfCalibration, self_calibration
-from forbes.evaluation.uniformity import pearson
+from forbes.evaluation.uniformity import kolmogorov_smirnov, pearson, spread
 from forbes.figures.calibration import RankedBelief, calibration
 from forbes.figures.style import PALETTE, save_figure
 from forbes.models import StateSpaceModel
+from forbes.seeding import generator
 
 __all__ = ["main"]
 
@@ -30,7 +31,8 @@ Check the calibration of trained models against themselves, without ground truth
 States and observations are drawn from the model's own prior; the filter sees the observations, and the drawn state is
 ranked among samples of its belief. Ranks are uniform where the filter is exact. A small p-value says that it is not;
 that fewer than 90 % of the states lie in the 90 % region says that its beliefs are too narrow. A filter trained by the
-ELBO is expected to be so. Prints a table, and draws calibration.png and calibration.pdf."""
+ELBO is expected to be so. Ranks are tested by Pearson, TARP's f by Kolmogorov and Smirnov, and a classifier tries to
+tell drawn states from samples of the beliefs. Prints a table, and draws calibration.png and calibration.pdf."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -70,19 +72,23 @@ def _check(run: TrainedRun, sequences: int, time: int, samples: int, seed: int) 
     if sequences > size:
         raise ForbesError(f"--sequences {sequences}: {run.path} was trained on {size} sequences. Choose fewer")
     action = run.data.sequences("train", torch.arange(sequences), time).action
-    return self_calibration(run.model, action, samples, seed)
+    try:
+        return self_calibration(run.model, action, samples, seed)
+    except ForbesError as error:  # where the training has diverged, say
+        raise ForbesError(f"{run.path}: {error}") from error
 
 
 def _print(runs: Sequence[TrainedRun], found: Sequence[SelfCalibration], samples: int) -> None:
     table = Table(title=f"{len(found[0].density)} states drawn from the model, ranked among {samples} of the belief")
     for header in ("run", "family"):
         table.add_column(header, overflow="fold")
-    for header in ("within 90 %", "p, density", "p, TARP", "p, values (smallest of D, times D)"):
+    for header in ("within 90 %", "p, density", "p, TARP", "p, values (smallest of D, times D)", "p, classifier"):
         table.add_column(header, justify="right")
     for run, one in zip(runs, found, strict=True):
         within = coverage(one.density, samples, torch.tensor([0.9])).item()
         each = pearson(one.value, samples)
         values = min(1.0, each.min().item() * len(each))  # Bonferroni
-        p_values = (pearson(one.density, samples).item(), pearson(one.tarp, samples).item(), values)
+        tarp = kolmogorov_smirnov(spread(one.tarp, samples, generator(0, "spread", 0))).item()
+        p_values = (pearson(one.density, samples).item(), tarp, values, one.classifier.p_value)
         table.add_row(escape(run.path), run.family, f"{within:.1%}", *(f"{p:.2g}" for p in p_values))
     Console(width=None if sys.stdout.isatty() else 160).print(table)

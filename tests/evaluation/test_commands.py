@@ -124,6 +124,16 @@ def test_every_score_is_measured_by_default_and_named_with_its_numbers(runs, cap
     assert all(name in out for name in ("elbo", "iwae", "pll", "fivo", "open_loop", "[bernoulli,K=4,c=2]"))
 
 
+@pytest.mark.parametrize("flags", [["MixtureBelief"], ["CategoricalBelief", "--model.belief.classes", "2"]])
+def test_every_belief_family_has_every_score(runs, tiny_config, tmp_path, capsys, flags):
+    run = str(fit(tiny_config, tmp_path / "run", "--model.belief", *flags))
+    numbers = ["--samples", "2", "--particles", "3", "--futures", "2", "--context", "2", "--digits", "3"]
+    assert main(["evaluate", run, runs[0], *numbers]) == 0
+
+    assert list(record(run)) == list(record(runs[0]))
+    assert flags[0].removesuffix("Belief") in capsys.readouterr().out
+
+
 def test_a_score_that_a_model_does_not_have_is_left_out_and_said(runs, other_filters, capsys):
     vector, particle = other_filters
     numbers = ["--samples", "2", "--particles", "4", "--futures", "4", "--context", "2", "--digits", "5"]

@@ -1,10 +1,13 @@
 """`forbes calibrate`, as a user calls it."""
 
+import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from forbes.cli import main
+from forbes.training.run_folder import RunFolder
 
 CONFIG = Path(__file__).parents[2] / "configs" / "pomdp" / "linear_gaussian" / "rssm.yaml"
 
@@ -29,6 +32,7 @@ def test_it_prints_the_coverage_and_draws_the_ranks(run, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "60 states drawn from the model, ranked among 19 of the belief" in out
     assert "within 90 %" in out
+    assert "p, classifier" in out
     assert {path.name for path in tmp_path.iterdir()} == {"calibration.png", "calibration.pdf"}
 
 
@@ -46,6 +50,24 @@ def test_what_cannot_be_checked_is_said_in_one_sentence(run, tmp_path, capsys, f
     (line,) = capsys.readouterr().err.splitlines()
     assert expected in line
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("belief", "family"), [("MixtureBelief", "Mixture"), ("CategoricalBelief", "Categorical")])
+def test_every_family_is_ranked(tmp_path, capsys, belief, family):
+    run = fit(tmp_path / "run", "--model.belief", belief, *["--model.belief.classes", "2"] * (family == "Categorical"))
+
+    assert main(["calibrate", run, "--sequences", "60", "--samples", "19", "--time", "3", "-o", str(tmp_path)]) == 0
+    assert family in capsys.readouterr().out
+
+
+def test_a_model_that_has_diverged_is_named(run, tmp_path, capsys):
+    folder = RunFolder(shutil.copytree(run, tmp_path / "run"))
+    checkpoint = torch.load(folder.checkpoint, weights_only=True)
+    next(value for name, value in checkpoint["state_dict"].items() if "gru" in name).fill_(float("nan"))
+    torch.save(checkpoint, folder.checkpoint)
+
+    assert main(["calibrate", str(folder), "--sequences", "60", "--time", "3", "-o", str(tmp_path / "figures")]) == 2
+    assert f"forbes: {folder}: " in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_particles_are_ranked_and_a_model_without_a_state_is_refused(tmp_path, capsys):
