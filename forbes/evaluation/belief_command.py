@@ -18,6 +18,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.belief_errors import ERRORS, Belief, belief_errors, mode_centres, moment_matched
 from forbes.evaluation.bounds import Increments
 from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.progress import with_progress
 from forbes.evaluation.record import describe, read_record, write_record
 from forbes.evaluation.runs import data_name, data_sha256, split_batches
 from forbes.evaluation.scoring import Scores, require_finite
@@ -123,11 +124,12 @@ def _same_data(runs: Sequence[_Run], args: Any) -> str:
     return hashes[0]
 
 
-def _score(run: _Run, args: Any, compare: Callable[[int, SequenceBatch, ExactFilter], Increments]) -> Scores:
+def _score(run: _Run, args: Any, name: str, compare: Callable[[int, SequenceBatch, ExactFilter], Increments]) -> Scores:
     """Compare beliefs with the exact ones, some sequences at a time, all in float64."""
     parts, masks = [], []
     with torch.random.fork_rng([]), torch.no_grad():
-        for first, batch in split_batches(run.data, args.split, args.sequences, _ROWS):
+        batches = split_batches(run.data, args.split, args.sequences, _ROWS)
+        for first, batch in with_progress(batches, f"{run.path} {name}", args.sequences):
             observation, action, state = batch.observation.double(), batch.action.double(), batch.state.double()
             exact = run.module.process.exact_filter(observation, action)
             torch.manual_seed(derive_seed(args.seed, "beliefs", first))
@@ -154,16 +156,18 @@ def _learned(run: _Run, args: Any) -> Scores:
             errors["elbo_gap"] = exact.step_log_likelihood - bound  # (B, T)
         return errors
 
-    scores = _score(run, args, compare)
+    scores = _score(run, args, "learned", compare)
     require_finite(run.path, 0, scores.values)
     return scores
 
 
 def _matched(run: _Run, args: Any) -> Scores:
     """Measure the Gaussian of the exact belief's mean and variance."""
-    return _score(
-        run, args, lambda first, batch, exact: _compare(run, args, first, batch, exact, moment_matched(exact.belief))
-    )
+
+    def compare(first: int, batch: SequenceBatch, exact: ExactFilter) -> Increments:
+        return _compare(run, args, first, batch, exact, moment_matched(exact.belief))
+
+    return _score(run, args, "moment-matched", compare)
 
 
 def _metric_name(run: _Run, args: Any, metric: str) -> str:

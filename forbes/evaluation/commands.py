@@ -5,20 +5,17 @@ import itertools
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import Progress
-
 from forbes.arguments import ArgumentParser, positive
-from forbes.data import SequenceBatch, Simulated, Split
+from forbes.data import Simulated, Split
 from forbes.errors import ForbesError
 from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.measured import Measured, note, pair
+from forbes.evaluation.progress import with_progress
 from forbes.evaluation.record import describe, read_record, write_record
 from forbes.evaluation.runs import (
     TrainedRun,
@@ -243,7 +240,7 @@ def _measure(one: Measured, job: _Job, sha256: str, args: Any) -> Parts:
     )
     began = time.monotonic()
     batches = split_batches(run.data, args.split, job.sequences, score.batch_size)
-    batches = _progress(batches, f"{run.path} {job.name}", job.sequences)
+    batches = with_progress(batches, f"{run.path} {job.name}", job.sequences)
     scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts)
     for metric in score.metrics:
         name = _metric_name(run, job, metric, args.split)
@@ -255,20 +252,3 @@ def _measure(one: Measured, job: _Job, sha256: str, args: Any) -> Parts:
             "seconds": round(time.monotonic() - began, 1),
         }
     return parts
-
-
-def _progress(
-    batches: Iterator[tuple[int, SequenceBatch]], name: str, sequences: int
-) -> Iterator[tuple[int, SequenceBatch]]:
-    """Pass batches on, with a bar on a terminal and a line at each tenth elsewhere."""
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(escape(name), total=sequences)
-        tenth = 0
-        for first, batch in batches:
-            yield first, batch
-            bar.advance(task, len(batch.mask))
-            done = first + len(batch.mask)
-            if bar.disable and 10 * done // sequences > tenth:
-                tenth = 10 * done // sequences
-                print(f"{name}: {done}/{sequences} sequences", file=sys.stderr, flush=True)

@@ -14,6 +14,7 @@ from forbes.data import Split
 from forbes.data.digit_classifiers import Judges, calibration_error
 from forbes.evaluation.completions import Prefixes, model_pass, neighbour_pass, summarise, summarise_classes, truth_pass
 from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.progress import with_progress
 from forbes.evaluation.runs import TrainedRun
 from forbes.evaluation.scoring import Pass, score_split
 
@@ -80,7 +81,8 @@ def study(
 
     def measure(name: str, path: str | None, run: TrainedRun, score: Pass) -> Row:
         where = f"{name}, {split} digits in the order of their length"
-        readings = score_split(run.model, prefixes.batches(data, split), score, seed, where).values
+        batches = with_progress(prefixes.batches(data, split), f"{name}, {context} steps seen", len(prefixes.digits))
+        readings = score_split(run.model, batches, score, seed, where).values
         classes, scores = readings["classes"], summarise(readings, prefixes, length)
         curves = (readings[curve].mean(0).tolist() for curve in ("best", "average"))
         return Row(name, path, scores, calibration_error(classes, prefixes.labels), classes, *curves)

@@ -60,10 +60,11 @@ def record(run):
 
 
 def error_of(capsys, *arguments):
-    """What a wrong call prints: one line, with exit code 2."""
+    """What a wrong call prints: one line after those of the progress, with exit code 2."""
     capsys.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    *progress, line = capsys.readouterr().err.splitlines()
+    assert all(each.endswith(" sequences") for each in progress)
     assert line.startswith("forbes: ")
     return line
 
