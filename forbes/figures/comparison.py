@@ -1,28 +1,33 @@
 """Families side by side in three pictures: their scores, their scores at each step, and who wins by which score."""
 
 import math
+from collections.abc import Sequence
 from itertools import cycle
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forbes.evaluation.comparison import Comparison
 from forbes.evaluation.measured import SCORES, score_of
-from forbes.figures.style import PAGE, PALETTE, paper_style
+from forbes.figures.style import GREY, PAGE, PALETTE, paper_style
 
 __all__ = ["differences", "per_step", "scores"]
 
 _PER_STEP = ("elbo", "pll", "open_loop_marginal", "degradation", "ess")
 """Scores whose value at a step means something by itself."""
+_FAR = 5  # times the range of the others
 
 
 def scores(comparison: Comparison) -> Figure:
     """Draw each score in a panel: a dot for each seed with its standard error, a bar at the mean over seeds.
 
-    The line of a family that does not have the score stays empty.
+    The line of a family that does not have the score stays empty. A family so far below the others that they would
+    fall on one spot is beyond the left edge, with its mean in words. Where the likelihood is known it is a dashed line.
     """
     table = comparison.scores
+    known = table[[score_of(metric) == "log_p" for metric in table["metric"]]]["mean"].mean()
     metrics = [metric for metric in table["metric"].unique() if score_of(metric) in SCORES]
     families = list(table["family"].unique())
     columns = min(3, len(metrics))
@@ -31,12 +36,9 @@ def scores(comparison: Comparison) -> Figure:
         figure = Figure((PAGE, rows * (1.1 + 0.22 * len(families))), layout="constrained")
         panels = figure.subplots(rows, columns, sharey=True, squeeze=False).flat
         for axes, metric in zip(panels, metrics, strict=False):
-            of_metric = table[table["metric"] == metric]
-            for place, (name, colour) in enumerate(zip(families, cycle(PALETTE), strict=False)):
-                own = of_metric[of_metric["family"] == name]
-                heights = place + 0.3 * (np.arange(1, len(own) + 1) / (len(own) + 1) - 0.5)
-                axes.errorbar(own["mean"], heights, xerr=own["standard_error"], fmt=".", color=colour, elinewidth=0.8)
-                axes.plot([own["mean"].mean()] * 2, [place - 0.35, place + 0.35], color=colour)
+            _draw_score(axes, table[table["metric"] == metric], families)
+            if score_of(metric) != "open_loop" and not np.isnan(known):
+                axes.axvline(known, color=GREY, ls="--", lw=0.8)
             axes.set_title(_in_lines(metric))
             axes.margins(x=0.15)
             axes.locator_params(axis="x", nbins=4)  # more labels than that touch
@@ -44,8 +46,33 @@ def scores(comparison: Comparison) -> Figure:
             axes.remove()
         panels[0].set_yticks(range(len(families)), families)
         panels[0].set_ylim(len(families) - 0.5, -0.5)
-        figure.supxlabel("nats per sequence; more is better", fontsize=8)
+        dashed = "" if np.isnan(known) else ", dashed: the exact log p, which no bound exceeds"
+        figure.supxlabel(f"nats per sequence, more is better{dashed}", fontsize=8)
     return figure
+
+
+def _draw_score(axes: Axes, of_metric: pd.DataFrame, families: Sequence[str]) -> None:
+    near = _near(of_metric.groupby("family", sort=False)["mean"].mean().dropna())
+    for place, (name, colour) in enumerate(zip(families, cycle(PALETTE), strict=False)):
+        own = of_metric[of_metric["family"] == name]
+        mean = own["mean"].mean()
+        if name in near:
+            heights = place + 0.3 * (np.arange(1, len(own) + 1) / (len(own) + 1) - 0.5)
+            axes.errorbar(own["mean"], heights, xerr=own["standard_error"], fmt=".", color=colour, elinewidth=0.8)
+            axes.plot([mean] * 2, [place - 0.35, place + 0.35], color=colour)
+        elif not np.isnan(mean):
+            at_edge = axes.get_yaxis_transform()
+            axes.text(
+                0.02, place, f"← {mean:.1f}".replace("-", "−"), transform=at_edge, va="center", color=colour, fontsize=7
+            )
+
+
+def _near(means: pd.Series) -> list[str]:
+    """Name the families that share an axis: the last is left out while without it the others, 3 or more, fill it."""
+    ordered = means.sort_values(ascending=False)
+    while len(ordered) > 3 and ordered.iloc[0] - ordered.iloc[-1] > _FAR * (ordered.iloc[0] - ordered.iloc[-2]):
+        ordered = ordered.iloc[:-1]
+    return list(ordered.index)
 
 
 def per_step(comparison: Comparison) -> Figure | None:

@@ -145,6 +145,18 @@ def test_a_score_that_a_family_does_not_have_is_empty(configs, vector, compared,
     assert [entry.get_text() for entry in legend.get_texts()] == ["rssm", "vector"]
 
 
+def test_a_family_far_below_the_others_stands_at_the_edge_in_words_and_the_known_likelihood_is_drawn():
+    means = {"a": -1.0, "b": -1.2, "c": -1.1, "far": -40.0}
+    rows = [(f, "test/elbo[S=1]", v) for f, v in means.items()] + [(f, "test/log_p[exact]", -0.5) for f in means]
+    table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
+
+    (panel,) = scores(Comparison(table, table, {})).axes
+
+    assert [text.get_text() for text in panel.texts] == ["← −40.0"]
+    assert panel.get_xlim()[0] > -3
+    assert panel.lines[-1].get_xdata()[0] == -0.5
+
+
 def test_a_difference_that_two_families_do_not_have_says_so():
     rows = [("a", "test/elbo[S=1]", 1.0), ("a", "test/pll[K=1]", 2.0), ("b", "test/pll[K=1]", -1.0)]
     table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
