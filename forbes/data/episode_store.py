@@ -56,6 +56,7 @@ class EpisodeStore:
         self.watermark = 0
         self.first = 0
         """Episodes before this number are forgotten."""
+        self.forgotten_steps, self.forgotten_frames = 0, 0
         text = self.index.read_text(errors="replace") if self.index.is_file() else ""
         for place, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):  # a kill may cut the last
             try:
@@ -80,7 +81,10 @@ class EpisodeStore:
             self.records = {n: record for n, record in self.records.items() if n < number}
         elif event == "forgotten_before":
             self.first = number
-            self.records = {n: record for n, record in self.records.items() if n >= number}
+            for forgotten in [n for n in self.records if n < number]:
+                record = self.records.pop(forgotten)
+                self.forgotten_steps += record.steps
+                self.forgotten_frames += record.frames
         else:
             raise ValueError(event)
 

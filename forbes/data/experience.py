@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from forbes.data.collection import MakePolicy, collect_episodes, describe_environment, episode_seed
-from forbes.data.episode_store import EpisodeWriter
+from forbes.data.episode_store import EpisodeWriter, first_held
 from forbes.data.episodes import EpisodeRecord
 from forbes.data.player import Player
 from forbes.data.replay import Replay, Windows
@@ -28,7 +28,7 @@ class Experience(SequenceSource):
     Args:
         task: as for `forbes data collect`: `cartpole_swingup`, `mountain_hike`, `gymnasium:ID`, a class of your own.
         options: of its environment, e.g. `{pixels: false, action_repeat: 4}`.
-        capacity: agent steps of the latest episodes that are drawn from; None draws from all.
+        capacity: agent steps of the latest episodes that are kept; None keeps all.
 
     Raises:
         ForbesError: for an unknown task or option.
@@ -109,6 +109,12 @@ class Experience(SequenceSource):
         self._look()
         return record
 
+    def forget(self) -> None:
+        """Delete the episodes beyond the capacity, which are drawn no more; a checkpoint must know of the newest."""
+        writer = self._open()
+        writer.forget(first_held(writer.records.values(), self.capacity))
+        self._look()
+
     def begun(self, policy: str, seed: int, most: int) -> int:
         """Count the first episodes, of at most so many, that `collect` with these arguments would play again."""
         count = 0
@@ -127,12 +133,14 @@ class Experience(SequenceSource):
     @property
     def env_steps(self) -> int:
         """Frames of the simulator so far, action repeat included."""
-        return sum(record.frames for record in self._open().records.values())
+        writer = self._open()
+        return writer.forgotten_frames + sum(record.frames for record in writer.records.values())
 
     @property
     def agent_steps(self) -> int:
         """Actions so far."""
-        return sum(record.steps for record in self._open().records.values())
+        writer = self._open()
+        return writer.forgotten_steps + sum(record.steps for record in writer.records.values())
 
     @property
     def watermark(self) -> int | None:

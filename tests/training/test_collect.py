@@ -186,6 +186,29 @@ def test_a_disk_that_is_full_ends_the_training_and_loses_nothing(run, tmp_path, 
     pd.testing.assert_frame_equal(read_metrics(tmp_path / "run"), read_metrics(run), check_exact=True)
 
 
+def test_an_agent_keeps_as_many_episodes_as_its_capacity_holds_and_counts_all(run, tmp_path, monkeypatch):
+    """Two of the parrot's, of 8 steps, and the one before each epoch; killed in the last one, it goes on the same."""
+    fit_it = ("--config", write_config(tmp_path), "--data.source.capacity", 16, "--run_dir")
+
+    def kill(self, loss):
+        if self.global_step == 10:
+            raise Killed
+
+    assert fit(*fit_it, tmp_path / "whole") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(ImaginationActorCritic, "on_before_backward", kill)
+        with pytest.raises(Killed):
+            fit(*fit_it, tmp_path / "cut")
+    assert fit("--resume", tmp_path / "cut") == 0
+
+    for folder in (tmp_path / "whole", tmp_path / "cut"):
+        kept = sorted(path.name for path in (folder / "episodes").glob("*.npz"))
+        assert kept == ["000001.npz", "000002.npz", "000003.npz"]
+    metrics = read_metrics(tmp_path / "whole")
+    assert metrics["env_steps"].dropna().tolist() == read_metrics(run)["env_steps"].dropna().tolist()
+    pd.testing.assert_frame_equal(read_metrics(tmp_path / "cut"), metrics, check_exact=True)
+
+
 class Killed(BaseException):
     """What the test kills a training with."""
 

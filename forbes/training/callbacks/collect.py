@@ -83,6 +83,8 @@ class Collect(Callback):
         source, agent = _experience(trainer), cast(ActingModel, pl_module)
         if trainer.current_epoch == 0:  # a start that was cut off in its first epoch has left no checkpoint to say so
             source.watermark = source.begun("random", agent.seed, self.seed_episodes)
+        else:  # nor would a run that goes on from the checkpoint draw from what is forgotten now
+            source.forget()
         for record in source.collect(self.seed_episodes, random_policy, "random", agent.seed):
             _say(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
         with _eval_mode(agent):
