@@ -85,6 +85,23 @@ def test_every_agent_trains(kind, tmp_path):
     assert torch.isfinite(torch.tensor(read_metrics(tmp_path / "run")["train/reward"].dropna().values)).all()
 
 
+def test_an_agent_of_deepmind_control_trains_and_lives_through_the_same_whole_episodes_again(tmp_path):
+    """A thousand frames of the physics an episode, eight an action; in processes that start anew."""
+    options = "{pixels: false, action_repeat: 8}"
+    task = ("--data.source.task", "cartpole_balance", "--data.source.options", options)
+    stores = []
+    for name in ("run", "again"):
+        assert fit("--config", write_config(tmp_path), *task, "--run_dir", tmp_path / name) == 0
+        stores.append(EpisodeStore(tmp_path / name / "episodes"))
+
+    assert read_metrics(tmp_path / "run")["env_steps"].dropna().tolist() == [2000, 3000, 4000]
+    for number in range(4):
+        first, again = (store.episode(number) for store in stores)
+        assert first.observation.shape == (126, 5)
+        for ours, theirs in zip(first[:3], again[:3], strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
 def test_an_agent_plays_discrete_actions_where_the_environment_has_them(tmp_path):
     """The tiger's door is opened or not, at random and by the agent; and what it plays is what it learns from."""
     config = write_config(tmp_path)
