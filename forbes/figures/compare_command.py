@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from forbes.training.provenance import commit
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
+
+_SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed")  # the first is linked to the others
 
 _DESCRIPTION = """\
 Train configurations under several seeds, measure all of them on the same sequences, and compare.
@@ -91,26 +94,24 @@ def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, 
 def _fit(config: str, seed: int, run: str, flags: Sequence[str]) -> None:
     """Train a run to its end; one that has been trained is left at once by `forbes fit --resume`."""
     print(f"training {run}", flush=True)
-    arguments = ["--config", config, *flags, "--seed_everything", str(seed)]
     if RunFolder(run).checkpoint.exists():
-        _require_same_configuration(run, arguments)
+        _require_same_configuration(run, config, seed, flags)
         status = _forbes_fit(["--resume", run])
     else:
-        status = _forbes_fit([*arguments, "--run_dir", run])
+        status = _forbes_fit(["--config", config, *flags, "--seed_everything", str(seed), "--run_dir", run])
     if status != 0:
         raise ForbesError(
             f"{run}: its training ended with status {status}. Mend that, then give the same command again"
         )
 
 
-def _require_same_configuration(run: str, arguments: Sequence[str]) -> None:
+def _require_same_configuration(run: str, config: str, seed: int, flags: Sequence[str]) -> None:
     """Refuse a run that was trained otherwise: unequal updates, say, would be compared unseen.
 
     Callbacks do not count, since they watch; nor do keys that the run's version of this package did not have.
     """
-    asked, own = (
-        _flat(yaml.safe_load(text)) for text in (_configuration(arguments), RunFolder(run).config.read_text())
-    )
+    own = _flat(yaml.safe_load(RunFolder(run).config.read_text()))
+    asked = _flat(yaml.safe_load(_configuration(config, *flags))) | {key: seed for key in _SEEDS}
     for key in asked:
         if key in own and own[key] != asked[key] and key != "trainer.callbacks":
             raise ForbesError(
@@ -126,16 +127,13 @@ def _flat(section: Any, name: str = "") -> dict[str, Any]:
     return {k: v for key, value in section.items() for k, v in _flat(value, f"{name}.{key}".strip(".")).items()}
 
 
-def _configuration(arguments: Sequence[str]) -> str:
+@cache
+def _configuration(config: str, *flags: str) -> str:
     """Ask `forbes fit` for the whole configuration it would train by."""
-    asked = subprocess.run(
-        [sys.executable, "-m", "forbes", "fit", *arguments, "--print_config"],
-        stdout=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-m", "forbes", "fit", "--config", config, *flags, "--print_config"]
+    asked = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if asked.returncode != 0:
-        raise ForbesError(f"{shlex.join(arguments)}: `forbes fit` cannot train by that (above). Mend it")
+        raise ForbesError(f"{config}: `forbes fit` cannot train by it (above). Mend it")
     return asked.stdout
 
 

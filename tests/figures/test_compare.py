@@ -26,9 +26,9 @@ def in_this_process(arguments):
     return main(["fit", *arguments])
 
 
-def configuration_in_this_process(arguments):
+def configuration_in_this_process(config, *flags):
     with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit, match="0"):
-        main(["fit", *arguments, "--print_config"])
+        main(["fit", "--config", config, *flags, "--print_config"])
     return printed.getvalue()
 
 
