@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from forbes.evaluation.comparison import Comparison
 from forbes.evaluation.measured import SCORES, score_of
-from forbes.figures.style import GREY, PAGE, PALETTE, paper_style
+from forbes.figures.style import COLUMN, GREY, PAGE, PALETTE, paper_style
 
 __all__ = ["differences", "per_step", "scores"]
 
@@ -84,7 +84,7 @@ def per_step(comparison: Comparison) -> Figure | None:
     rows = math.ceil(len(metrics) / columns)
     colours = dict(zip(comparison.scores["family"].unique(), cycle(PALETTE), strict=False))
     with paper_style():
-        figure = Figure((PAGE, 2.4 * rows + 0.2), layout="constrained")
+        figure = Figure((PAGE if columns > 1 else COLUMN, 2.4 * rows + 0.2), layout="constrained")
         panels = figure.subplots(rows, columns, squeeze=False).flat
         for axes, metric in zip(panels, metrics, strict=False):
             _draw_steps(axes, comparison.curves[metric], metric, colours)
@@ -92,7 +92,7 @@ def per_step(comparison: Comparison) -> Figure | None:
             axes.remove()
         lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}  # some lack some families
         named = {name: lines[name] for name in colours if name in lines}
-        figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=4)
+        figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=4 if columns > 1 else 2)
     return figure
 
 

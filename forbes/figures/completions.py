@@ -1,7 +1,7 @@
 """Completions of digits in pictures: what is drawn and its class, the scores, and the error of the best of n."""
 
 from collections.abc import Sequence
-from itertools import cycle
+from itertools import chain, cycle
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from forbes.evaluation.completion_scores import entropy
 from forbes.evaluation.completion_study import Row, Study
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.predictions import complete
-from forbes.figures.grids import Bars, Panel, draw_panels
+from forbes.figures.grids import Bars, Panel, draw_bands
 from forbes.figures.style import BLACK, GREY, PAGE, PALETTE, paper_style
 from forbes.models import BeliefModel
 from forbes.seeding import derive_seed
@@ -25,6 +25,9 @@ __all__ = ["by_ambiguity", "drawings", "errors", "scores"]
 
 _SHOWN = 5
 """Completions of each digit."""
+_SIDE_BY_SIDE = 2
+"""Models; further ones are drawn below, beside the same digits."""
+_LEGEND = 5  # names in a line
 _SCORES = {  # of the class, with the rows that are no model's
     "js[end]": ("JS to the reference, nats", ("similar",)),
     "entropy[end]": ("entropy of the class, nats", ("similar", "reference")),
@@ -46,6 +49,8 @@ def by_ambiguity(reference: Tensor, count: int) -> Tensor:
 def drawings(study: Study, models: Sequence[BeliefModel], batch: SequenceBatch, place: Tensor, seed: int) -> Figure:
     """Draw beginnings from the most to the least ambiguous, with completions and the classes that these show.
 
+    Two models beside each other, further ones below.
+
     Args:
         study: of one length of the prefix.
         models: of its runs.
@@ -58,19 +63,21 @@ def drawings(study: Study, models: Sequence[BeliefModel], batch: SequenceBatch, 
     truth, seen = (batch.observation[digit, step - 1][:, None].float() for step in (end, torch.full_like(end, context)))
     reference = study.reference.classes[place].numpy()  # (R, 10)
     ambiguity = [f"H = {value:.2f}" for value in study.reference.scores["entropy[end]"][place].tolist()]
-    panels: list[Panel | Bars] = [
+    beginnings: list[Panel | Bars] = [
         Panel("truth", truth, BLACK, ["end"]),
         Panel("seen", seen, GREY, [f"t={context}"]),
         Bars("reference", reference, GREY, notes=ambiguity),
     ]
+    of_models: list[list[Panel | Bars]] = []
     for row, model, colour in zip(study.runs, models, cycle(PALETTE), strict=False):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(seed, "drawings", context))
             frames = complete(model, batch, context, _SHOWN).frames[:, digit, end - context - 1]  # (S, R, 1, H, W)
         notes = [f"JS = {value:.2f}" for value in row.scores["js[end]"][place].tolist()]
-        panels.append(Panel(row.name, frames.transpose(0, 1), colour))
-        panels.append(Bars("their classes", row.classes[place].numpy(), colour, reference, notes))
-    return draw_panels(panels)
+        classes = Bars("their classes", row.classes[place].numpy(), colour, reference, notes)
+        of_models.append([Panel(row.name, frames.transpose(0, 1), colour), classes])
+    pairs = [of_models[first : first + _SIDE_BY_SIDE] for first in range(0, len(of_models), _SIDE_BY_SIDE)]
+    return draw_bands([[*beginnings, *chain(*pair)] for pair in pairs])
 
 
 def scores(studies: Sequence[Study]) -> Figure:
@@ -88,9 +95,8 @@ def scores(studies: Sequence[Study]) -> Figure:
             axes.set(title=title, xlabel="steps seen", xticks=[one.prefixes.context for one in studies])
             axes.set_ylim(bottom=0)
             labelled |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
-        figure.legend(
-            list(labelled.values()), list(labelled), loc="outside upper center", ncols=len(labelled), handlelength=3
-        )
+        columns = min(len(labelled), _LEGEND)
+        figure.legend([*labelled.values()], [*labelled], loc="outside upper center", ncols=columns, handlelength=3)
     return figure
 
 
@@ -110,11 +116,13 @@ def errors(studies: Sequence[Study]) -> Figure:
             rows = [*zip(study.runs, cycle(PALETTE), strict=False), (study.similar, GREY)]
             for row, colour in rows:
                 number = np.arange(1, len(row.best) + 1)
-                axes.plot(number, row.best, color=colour, label=f"{row.name}, best of n")
-                axes.plot(number, row.average, "--", color=colour, label="average of n")
+                axes.plot(number, row.best, color=colour, label=row.name)
+                axes.plot(number, row.average, "--", color=colour)
             axes.set(title=f"{study.prefixes.context} steps seen", xlabel="completions, n", xscale="log")
             axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axes.set_ylim(bottom=0)
         panels[0].set_ylabel("squared error in pixels")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(rows))
+        lines = panels[0].get_legend_handles_labels()
+        title = "best of n; dashed, average of n"
+        figure.legend(*lines, loc="outside upper center", ncols=min(len(rows), _LEGEND), title=title, title_fontsize=7)
     return figure

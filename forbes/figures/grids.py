@@ -78,30 +78,40 @@ def draw_panels(panels: Sequence[Panel | Bars], width: float = PAGE) -> Figure:
 
 
 def draw_bands(bands: Sequence[Sequence[Panel | Bars]], width: float = PAGE) -> Figure:
-    """Draw panels beside each other in bands under each other; those of a band have equal rows, all bands columns."""
+    """Draw panels beside each other in bands under each other.
+
+    Those of a band have equal rows, all bands columns; the last may have fewer panels. A band with titles, or labels,
+    has room for them.
+    """
     first = [_first(band) for band in bands]
     height, wide = first[0].images.shape[3:]
     margin, title, labels, between = 0.03, 0.24, 0.18, 0.07  # inches: left and right, above, below, under a band
+    above = [title if any(panel.title for panel in band) else 0.0 for band in bands]  # inches
+    below = [labels if any(_is_labelled(panel) for panel in band) else between for band in bands]  # inches
     names = 0.5 if first[0].names else 0.0  # inches, at the left
     space = 0.7  # between panels, in frames
     columns = [panel.images.shape[1] if isinstance(panel, Panel) else _BARS_COLUMNS for panel in bands[0]]
     cell = (width - 2 * margin - names) / (sum(columns) + space * (len(columns) - 1))  # inches
     talls = [panel.images.shape[0] * cell * height / wide for panel in first]  # inches
-    total = title + sum(talls) + between * (len(bands) - 1) + labels
+    total = sum(above) + sum(talls) + sum(below)
     with paper_style():
         figure = Figure((width, total))
-        bottom = total - title
-        for band, tall in zip(bands, talls, strict=True):
-            bottom, left = bottom - tall, margin + names
-            for panel, count in zip(band, columns, strict=True):
+        bottom = total
+        for band, tall, room, under in zip(bands, talls, above, below, strict=True):
+            bottom, left = bottom - room - tall, margin + names
+            for panel, count in zip(band, columns[: len(band)], strict=True):
                 axes = figure.add_axes((left / width, bottom / total, count * cell / width, tall / total))
                 if isinstance(panel, Panel):
                     _draw_panel(axes, panel)
                 else:
                     _draw_bars(axes, panel)
                 left += (count + space) * cell
-            bottom -= between
+            bottom -= under
     return figure
+
+
+def _is_labelled(panel: Panel | Bars) -> bool:
+    return isinstance(panel, Bars) or bool(panel.labels)
 
 
 def _first(band: Sequence[Panel | Bars]) -> Panel:

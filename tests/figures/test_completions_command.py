@@ -12,7 +12,7 @@ import torch
 from forbes.cli import main
 from forbes.data import digit_classifiers
 from forbes.figures.completions import by_ambiguity
-from forbes.figures.grids import Bars, Panel, draw_panels
+from forbes.figures.grids import Bars, Panel, draw_bands, draw_panels
 from forbes.figures.style import BLUE
 from forbes.training.run_folder import RunFolder
 
@@ -127,6 +127,19 @@ def test_digits_are_drawn_from_the_most_to_the_least_ambiguous():
     assert by_ambiguity(reference, 5).tolist() == [0, 2, 4, 3, 1]
     assert by_ambiguity(reference, 3).tolist() == [0, 4, 1]
     assert by_ambiguity(reference, 9).tolist() == [0, 2, 4, 3, 1]
+
+
+def test_a_band_with_titles_has_room_for_them_below_the_labels_of_the_one_above():
+    frames = torch.ones(2, 1, 1, 4, 4)
+    bands = [[Panel("a", frames, BLUE), Bars("b", np.ones((2, 3)), BLUE)], [Panel("c", frames, BLUE)]]
+
+    figure = draw_bands(bands)
+
+    first, bars, second = figure.axes
+    apart = (first.get_position().y0 - second.get_position().y1) * figure.get_figheight()  # inches
+    assert apart * 72 > first.title.get_fontsize() + bars.get_xticklabels()[0].get_fontsize() + 4  # points
+    assert second.get_position().y0 > 0
+    assert first.get_position().width == pytest.approx(second.get_position().width)
 
 
 def test_bars_stand_beside_their_row_with_their_note():
