@@ -218,6 +218,14 @@ def test_both_runs_record_the_same_paired_difference(runs, capsys):
     assert f"{mine['mean']:+.2f} ± {mine['standard_error']:.2f}" in capsys.readouterr().out
 
 
+def test_more_particles_than_memory_are_named_after_a_try_with_fewer_sequences(runs, capsys):
+    assert evaluate(runs[0], "--scores", "fivo", "--particles", "1000000000000", "--digits", "2") == 2
+
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert f"{runs[0]}, test split: no memory for one sequence with K=1000000000000. Choose fewer particles" in error
+    assert record_is_missing(runs[0])
+
+
 def test_an_interrupted_evaluation_goes_on_where_it_stopped(runs, monkeypatch):
     evaluate(runs[0], "--batch-size", "5")
     whole, calls = record(runs[0])[NAME], []
