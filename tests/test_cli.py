@@ -11,7 +11,7 @@ import yaml
 
 from forbes import __version__
 from forbes.cli import COMMANDS, main
-from forbes.training import WorldModel
+from forbes.training import WorldModel, configuration
 from forbes.training.run_folder import RunFolder, read_metrics
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -152,6 +152,21 @@ def test_a_configuration_cannot_run_a_foreign_module_unless_allowed(tiny_config,
     assert not Path("executed").exists()
     assert main([*flags, "--allow-module", "stranger"]) == 0
     assert Path("executed").exists()
+
+
+def test_a_family_of_ones_own_is_compared(tiny_config, in_tmp_path, monkeypatch, capfd):
+    """Its trainings are processes of their own, which must know its module too; given again, it trains nothing."""
+    Path("mine.py").write_text("from forbes.beliefs import GaussianBelief\nclass MyBelief(GaussianBelief): ...\n")
+    monkeypatch.setattr(configuration, "_allowed", {})  # without those of other tests, which are elsewhere
+    flags = ["--model.belief", "mine.MyBelief", "--trainer.max_epochs", "1"]
+    command = ["--allow-module", "mine", "compare", str(tiny_config), "--scores", "elbo", "-o", "runs", "--", *flags]
+
+    for _ in range(2):
+        assert main(command) == 0
+        out = capfd.readouterr().out
+        assert "MyBelief" in json.dumps(yaml.safe_load(Path("runs/forbes-0/config.yaml").read_text()))
+        assert "comparison.csv" in out
+    assert "epoch 1/1" not in out
 
 
 def test_a_run_folder_is_named_after_its_configuration_and_holds_all_of_the_run(tiny_config, in_tmp_path, capsys):

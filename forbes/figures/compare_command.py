@@ -23,6 +23,7 @@ from forbes.evaluation.runs import load_runs
 from forbes.figures.comparison import differences, per_step, scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
+from forbes.training.configuration import allowed_modules
 from forbes.training.provenance import commit
 from forbes.training.run_folder import RunFolder
 
@@ -130,8 +131,7 @@ def _flat(section: Any, name: str = "") -> dict[str, Any]:
 @cache
 def _configuration(config: str, *flags: str) -> str:
     """Ask `forbes fit` for the whole configuration it would train by."""
-    command = [sys.executable, "-m", "forbes", "fit", "--config", config, *flags, "--print_config"]
-    asked = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    asked = _run_fit(["--config", config, *flags, "--print_config"], stdout=subprocess.PIPE)
     if asked.returncode != 0:
         raise ForbesError(f"{config}: `forbes fit` cannot train by it (above). Mend it")
     return asked.stdout
@@ -139,7 +139,12 @@ def _configuration(config: str, *flags: str) -> str:
 
 def _forbes_fit(arguments: Sequence[str]) -> int:
     """Run `forbes fit` in a process of its own: trainings leave nothing behind in one another."""
-    return subprocess.run([sys.executable, "-m", "forbes", "fit", *arguments], check=False).returncode
+    return _run_fit(arguments).returncode
+
+
+def _run_fit(arguments: Sequence[str], stdout: int | None = None) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "forbes", *allowed_modules(), "fit", *arguments]
+    return subprocess.run(command, stdout=stdout, text=True, check=False)
 
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:

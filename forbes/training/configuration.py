@@ -11,9 +11,10 @@ from lightning.pytorch.cli import LightningArgumentParser
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 
-__all__ = ["add_links", "add_seed", "allow_modules", "experiment_parser"]
+__all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "experiment_parser"]
 
 TRUSTED = ("forbes", "lightning", "torch")
+_allowed: dict[str, None] = {}  # in their order, as long as the process lives: jsonargparse keeps them too
 
 
 def allow_modules(names: Sequence[str] = ()) -> None:
@@ -32,7 +33,13 @@ def allow_modules(names: Sequence[str] = ()) -> None:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
             raise ForbesError(f"--allow-module {name}: {error}. Name an installed one or one of this folder") from error
+    _allowed.update(dict.fromkeys(names))
     set_parsing_settings(import_path_denylist=["*"], import_path_allowlist=[*TRUSTED, *names])
+
+
+def allowed_modules() -> list[str]:
+    """Give the flags that let another process name the classes of the same modules."""
+    return [part for name in _allowed for part in ("--allow-module", name)]
 
 
 def add_seed(parser: LightningArgumentParser) -> None:
