@@ -17,23 +17,27 @@ from forbes.seeding import derive_seed
 __all__ = ["Agent", "Choice", "explore", "follow_plan", "noisy", "take_mode"]
 
 Choice: TypeAlias = Callable[[Filtered], Tensor]
-"""What to do at the last step of a filtered history, `(1, 1, …)`: an action, `(1, A)`, in [-1, 1] or one-hot."""
+"""What to do at the last step of K filtered trajectories, `(K, 1, …)`: an action, `(1, A)`, in [-1, 1] or one-hot."""
 
 
 class Agent:
     r"""Plays one episode: shown o_t, it moves its belief on and gives a_t.
 
-    .. math:: (h_t, s_t) \sim q(\cdot \mid o_{1:t}, a_{1:t-1}), \qquad a_t = \mathrm{choice}(h_t, s_t)
+    .. math:: f_t^k = [h_t^k, s_t^k] \sim q(\cdot \mid o_{1:t}, a_{1:t-1}), \qquad
+              a_t = \mathrm{choice}(f_t^1, \dots, f_t^K)
+
+    With K = 1, as in the paper, it acts on one guess of its state; more of them tell how certain it can be.
 
     Args:
         model: in eval mode.
         choose: see `Choice`; e.g. `take_mode(actor)`.
         seed: of everything that is drawn; step t depends on (seed, t) and on what was shown.
+        samples: K, trajectories of the posterior.
     """
 
-    def __init__(self, model: StateSpaceModel, choose: Choice, seed: int) -> None:
-        self.model, self.choose, self.seed = model, choose, seed
-        self.belief, self.steps = model.initial(1), 0
+    def __init__(self, model: StateSpaceModel, choose: Choice, seed: int, samples: int = 1) -> None:
+        self.model, self.choose, self.seed, self.samples = model, choose, seed, samples
+        self.belief, self.steps = model.initial(samples), 0
         self.action = self.belief.state.new_zeros(1, model.action_dim)
 
     @torch.no_grad()
@@ -43,7 +47,9 @@ class Agent:
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(derive_seed(self.seed, "act", self.steps))
             shown = torch.from_numpy(observation).to(device)[None, None]  # (1, 1, *O)
-            filtered = self.model.filter(self.model.embed(shown), self.action[:, None], self.belief)
+            embedding = self.model.embed(shown).expand(self.samples, -1, -1)  # (K, 1, E)
+            taken = self.action[:, None].expand(self.samples, -1, -1)  # (K, 1, A)
+            filtered = self.model.filter(embedding, taken, self.belief)
             self.action = self.choose(filtered)
         self.belief, self.steps = filtered.at(0), self.steps + 1
         action: NDArray[np.float32] = self.action[0].float().cpu().numpy()
@@ -51,11 +57,15 @@ class Agent:
 
 
 def take_mode(actor: Actor) -> Choice:
-    """Take the most probable action, as for an evaluation."""
+    r"""Take the most probable action, as for an evaluation; of K trajectories, what they agree on.
+
+    .. math:: a = \tfrac1K \sum_k \mathrm{mode}\,\pi(\cdot \mid f^k), \qquad
+              \text{of discrete actions the one that most trajectories choose}
+    """
 
     def choose(filtered: Filtered) -> Tensor:
         policy: Policy = actor(filtered.features[:, 0])
-        return policy.mode()
+        return _agreed(policy.mode(), actor.discrete)
 
     return choose
 
@@ -70,9 +80,15 @@ def explore(actor: Actor, amount: float) -> Choice:
 
     def choose(filtered: Filtered) -> Tensor:
         policy: Policy = actor(filtered.features[:, 0])
-        return policy.rsample()[0]
+        return _agreed(policy.rsample()[0], actor.discrete)
 
     return _sometimes_any(choose, amount) if actor.discrete else noisy(choose, amount)
+
+
+def _agreed(action: Tensor, discrete: bool) -> Tensor:
+    """Give the mean of K actions, or the commonest, `(K, A)` to `(1, A)`."""
+    mean = action.mean(0, keepdim=True)  # (1, A)
+    return one_hot_of(mean.argmax(-1, keepdim=True), mean) if discrete else mean
 
 
 def noisy(choose: Choice, noise: float) -> Choice:
@@ -97,12 +113,16 @@ def _sometimes_any(choose: Choice, chance: float) -> Choice:
 
 
 def follow_plan(model: StateSpaceModel, reward: Callable[[Tensor], Tensor], search: CrossEntropy) -> Choice:
-    """Search anew at each step, every candidate on a sample of the belief of its own (PlaNet)."""
+    """Search anew at each step, every candidate on a sample of the belief of its own (PlaNet).
+
+    Of K trajectories, the candidates take turns.
+    """
 
     def choose(filtered: Filtered) -> Tensor:
-        state, _ = model.posterior.rsample(filtered.context[:, 0], (search.candidates,))  # (J, 1, D)
-        hidden = filtered.hidden[:, 0].expand(search.candidates, -1, -1)  # (J, 1, H)
-        start = State(hidden.flatten(0, 1), state.flatten(0, 1))  # (J, H), (J, D)
+        turns = -(-search.candidates // len(filtered.hidden))
+        state, _ = model.posterior.rsample(filtered.context[:, 0], (turns,))  # (J / K, K, D)
+        hidden = filtered.hidden[:, 0].expand(turns, -1, -1)  # (J / K, K, H)
+        start = State(*(values.flatten(0, 1)[: search.candidates] for values in (hidden, state)))  # (J, H), (J, D)
         return plan(model, reward, start, model.action_dim, search)
 
     return choose

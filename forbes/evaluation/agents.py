@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
+from forbes.arguments import ArgumentParser, positive
 from forbes.data import Experience
 from forbes.data.collection import describe_environment
 from forbes.data.episodes import Episode
@@ -26,7 +27,7 @@ from forbes.training.loading import load_run, loaded_agent
 from forbes.training.provenance import commit
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["evaluate_agents", "is_agent", "play_test_episode"]
+__all__ = ["add_acting_samples", "evaluate_agents", "is_agent", "play_test_episode"]
 
 _APART = ("made_by", "shows", "observation_shape")
 """In what environments of one task may differ: an agent that is shown the exact belief earns the same rewards."""
@@ -52,7 +53,7 @@ def is_agent(run: str) -> bool:
     return isinstance(module, ActingModel)
 
 
-def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, command: str) -> None:
+def evaluate_agents(runs: Sequence[str], episodes: int, samples: int, seed: int, device: str, command: str) -> None:
     """Let every agent play the same episodes, record its returns in its run folder, and print a table.
 
     Episode k of every run is reset with the same seed, none of which was used in a training. The action is the policy's
@@ -61,6 +62,7 @@ def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, 
     Args:
         runs: run folders.
         episodes: E, at least 2.
+        samples: K, trajectories of the belief that each action is chosen by.
         seed: of the episodes.
         device: of the models.
         command: for the record.
@@ -70,20 +72,20 @@ def evaluate_agents(runs: Sequence[str], episodes: int, seed: int, device: str, 
     """
     if episodes < 2:
         raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
-    name, played = f"return[episodes={episodes}]", list[_Played]()
+    tag, played = f"episodes={episodes}{'' if samples == 1 else f',K={samples}'}", list[_Played]()
     for run in runs:
         with loaded_agent(run, device) as (agent, environment):
             for first in played[:1]:
                 _require_same_task(first, run, describe_environment(environment))
-            played.append(_play(run, agent, environment, episodes, seed))
-        _record(played[-1], name, seed, command)
-    _print(played, name)
+            played.append(_play(run, agent, environment, episodes, samples, seed))
+        _record(played[-1], tag, seed, command)
+    _print(played, f"return[{tag}]")
 
 
-def _play(run: str, agent: ActingModel, environment: Environment, episodes: int, seed: int) -> _Played:
+def _play(run: str, agent: ActingModel, environment: Environment, episodes: int, samples: int, seed: int) -> _Played:
     returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
     for number in _counted(run, episodes):
-        episode = play_test_episode(agent, environment, seed, number)
+        episode = play_test_episode(agent, environment, seed, number, samples)
         returns.append(episode.total_reward)
         rewards.append(torch.from_numpy(episode.reward[1:]).double())  # (T,)
         draws = derive_seed(seed, "foresight", number)
@@ -92,7 +94,7 @@ def _play(run: str, agent: ActingModel, environment: Environment, episodes: int,
     return _Played(run, agent, total, explained(foretold, rewards), describe_environment(environment))
 
 
-def _record(one: _Played, name: str, seed: int, command: str) -> None:
+def _record(one: _Played, tag: str, seed: int, command: str) -> None:
     measured = {
         "checkpoint": RunFolder(one.run).checkpoint_sha256(),
         "command": command,
@@ -107,16 +109,27 @@ def _record(one: _Played, name: str, seed: int, command: str) -> None:
         "environment": one.environment,
     }
     shares = {
-        f"reward_explained[ahead={distance},S={SAMPLES},episodes={len(one.returns)}]": share._asdict() | measured
+        f"reward_explained[ahead={distance},S={SAMPLES},{tag}]": share._asdict() | measured
         for distance, share in zip(STEPS_AHEAD, one.explained, strict=True)
         if share is not None
     }
+    name = f"return[{tag}]"
     write_record(one.run, {name: entry | measured} | shares, {name: one.returns})
 
 
-def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int) -> Episode:
+def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int, samples: int) -> Episode:
     """Play an episode of a test, which was not in the training: for every agent, the same seed is the same episode."""
-    return play_measured(agent, environment, "test episode", seed, number)
+    return play_measured(agent, environment, "test episode", seed, number, samples)
+
+
+def add_acting_samples(parser: ArgumentParser) -> None:
+    """Add what says how an agent acts on its belief."""
+    parser.add_argument(
+        "--acting-samples",
+        type=positive,
+        default=1,
+        help="trajectories of its belief whose mean action an agent takes (default: 1, as in the paper)",
+    )
 
 
 def _counted(run: str, episodes: int) -> Iterator[int]:

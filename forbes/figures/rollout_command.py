@@ -5,7 +5,7 @@ from pathlib import Path
 
 from forbes.arguments import ArgumentParser, positive
 from forbes.errors import ForbesError
-from forbes.evaluation.agents import play_test_episode
+from forbes.evaluation.agents import add_acting_samples, play_test_episode
 from forbes.evaluation.runs import find_device
 from forbes.figures.grids import require_images
 from forbes.figures.video import gif
@@ -22,7 +22,7 @@ Let the agent of a run play without exploration, and film it.
 
 Writes a GIF of what the agent is shown, all episodes one after the other, and prints the return of each, its agent
 steps (actions) and env steps (frames, with action repeat). They are the first episodes that `forbes evaluate` plays
-with the same seed."""
+with the same seed and --acting-samples."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> None:
         remedy = f"Train on pixels; the return is told by: forbes evaluate {args.run}"
         require_images(args.run, environment.observation_shape, remedy)
         for number in range(args.episodes):
-            episode = play_test_episode(agent, environment, args.seed, number)
+            episode = play_test_episode(agent, environment, args.seed, number, args.acting_samples)
             steps = f"{len(episode.reward) - 1:,} agent steps, {episode.frames:,} env steps"
             print(f"episode {number + 1}: return {episode.total_reward:.2f}, {steps}", flush=True)
             frames.append(episode.observation)
@@ -50,6 +50,7 @@ def _parser() -> ArgumentParser:
     parser.add_argument("run", metavar="RUN", help="run folder of an agent that `forbes fit` has made")
     parser.add_argument("--video", type=Path, required=True, metavar="GIF", help="file to write")
     parser.add_argument("--episodes", type=positive, default=1, help="how many (default: 1)")
+    add_acting_samples(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
     parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda, cuda:1 …")
     return parser

@@ -107,6 +107,8 @@ class Acting:
 
     agent: ActingModel
     exploring: bool
+    samples: int = 1
+    """Trajectories of the belief that an action is chosen by."""
 
     @classmethod
     def as_it_is(cls, agent: ActingModel, exploring: bool) -> Self:
@@ -115,10 +117,12 @@ class Acting:
 
     def __call__(self, environment: Environment, seed: int) -> Agent:
         """See `MakePolicy`."""
-        return Agent(self.agent.model, self.agent.choose(self.exploring), seed)
+        return Agent(self.agent.model, self.agent.choose(self.exploring), seed, self.samples)
 
 
-def play_measured(agent: ActingModel, environment: Environment, purpose: str, seed: int, number: int) -> Episode:
+def play_measured(
+    agent: ActingModel, environment: Environment, purpose: str, seed: int, number: int, samples: int = 1
+) -> Episode:
     """Play an episode without exploration; it is a function of purpose, seed, number and the weights.
 
     Args:
@@ -127,8 +131,9 @@ def play_measured(agent: ActingModel, environment: Environment, purpose: str, se
         purpose: keeps these episodes apart from all others of the same seed.
         seed: of the measurement.
         number: of the episode.
+        samples: see `Acting`.
 
     Raises:
         ForbesError: where it breaks three times.
     """
-    return play_whole(environment, Acting(agent, exploring=False), episode_seed(seed, number, purpose), number)
+    return play_whole(environment, Acting(agent, False, samples), episode_seed(seed, number, purpose), number)
