@@ -117,7 +117,9 @@ def _record(one: _Played, tag: str, seed: int, command: str) -> None:
     write_record(one.run, {name: entry | measured} | shares, {name: one.returns})
 
 
-def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int, samples: int) -> Episode:
+def play_test_episode(
+    agent: ActingModel, environment: Environment, seed: int, number: int, samples: int = 1
+) -> Episode:
     """Play an episode of a test, which was not in the training: for every agent, the same seed is the same episode."""
     return play_measured(agent, environment, "test episode", seed, number, samples)
 
@@ -150,7 +152,7 @@ def _require_same_task(first: _Played, run: str, task: dict[str, Any]) -> None:
 
 def _print(played: Sequence[_Played], name: str) -> None:
     console = Console(width=None if sys.stdout.isatty() else 160)
-    table = Table(title=f"{name}: undiscounted, mean ± standard error over episodes; the same episodes for all")
+    table = Table(title=f"{escape(name)}: undiscounted, mean ± standard error over episodes; the same episodes for all")
     for header in ("run", "agent", "parameters", "return", "lowest", "highest"):
         table.add_column(header, overflow="fold", justify="left" if header in ("run", "agent") else "right")
     for one in played:

@@ -86,6 +86,60 @@ def test_what_was_seen_long_ago_matters():
     assert (one.belief.hidden - other.belief.hidden).abs().max() > 1e-4
 
 
+class Upwards:
+    """Goes up where the state is above 0, else down."""
+
+    def __init__(self, discrete):
+        self.discrete = discrete
+
+    def __call__(self, features):
+        up = features[:, 16:18] > 0  # the first two dimensions of s, after 16 of h
+        self.action = torch.stack((up[:, 0], ~up[:, 0]), 1).float() if self.discrete else 2 * up.float() - 1  # (K, 2)
+        return self
+
+    def mode(self):
+        return self.action
+
+
+def test_many_trajectories_act_on_the_belief_and_not_on_a_guess():
+    r"""After one observation the belief is N(μ, σ²): the mean action goes to 2 Φ(μ/σ) - 1, where one guess has ±1."""
+    model, _ = build()
+    guess, many = (Agent(model, take_mode(Upwards(discrete=False)), 0, samples) for samples in (1, 10_000))
+
+    assert set(np.abs(guess(OBSERVATIONS[0]))) == {1.0}
+    action = torch.from_numpy(many(OBSERVATIONS[0]))
+
+    hidden = model.gru(model.transition(torch.zeros(1, 6)), torch.zeros(1, 16))
+    embedding = model.encoder(torch.tensor(OBSERVATIONS[None, 0]))
+    mean, std = model.posterior.moments(model.posterior_context(torch.cat((hidden, embedding), -1)))
+    torch.testing.assert_close(action, torch.erf(mean / std / 2**0.5)[0, :2], atol=5 / 10_000**0.5, rtol=0)
+    many(OBSERVATIONS[1])
+    assert many.belief.hidden.std(0).min() > 0  # each goes on from its own state
+
+
+def test_many_trajectories_take_the_discrete_action_that_most_of_them_choose():
+    model, _ = build()
+    agent = Agent(model, take_mode(votes := Upwards(discrete=True)), 0, samples=9)
+
+    for observation in OBSERVATIONS:
+        action = agent(observation)
+        counts = votes.action.sum(0).numpy()
+        assert counts.sum() == 9
+        np.testing.assert_array_equal(action, counts == counts.max())
+
+
+def test_a_plan_may_spread_its_candidates_over_trajectories():
+    """20 candidates on 3 trajectories, which share their actions but not their states."""
+    model, actor = build()
+    agent = Agent(model, choices(model, actor)["plan"], seed=1, samples=3)
+
+    actions = np.stack([agent(o) for o in OBSERVATIONS])
+
+    assert actions.shape == (6, 2)
+    assert np.abs(actions).max() <= 1
+    assert len(agent.belief.state.unique(dim=0)) == 3
+
+
 def test_exploration_adds_noise_of_its_size_and_stays_in_bounds():
     """A policy that is almost certain of 0: what is left is the noise."""
     model, actor = build()

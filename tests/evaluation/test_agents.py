@@ -55,6 +55,21 @@ def test_every_agent_plays_the_same_episodes(run, tmp_path, capsys):
     assert "paired: 0.00 ± 0.00" in " ".join(capsys.readouterr().out.split())
 
 
+def test_acting_on_many_trajectories_is_a_measurement_of_its_own(run, capsys):
+    """It takes another action, and is kept beside what the agent earns by a guess."""
+    assert forbes("evaluate", run, "--episodes", 3) == 0
+    assert forbes("evaluate", run, "--episodes", 3, "--acting-samples", 4) == 0
+
+    record = read_record(str(run))
+    guess, many = (record[name]["returns"] for name in (NAME, "return[episodes=3,K=4]"))
+    assert len(many) == 3
+    assert guess != many
+    assert "reward_explained[ahead=1,S=16,episodes=3,K=4]" in record
+    assert "return[episodes=3,K=4]" in capsys.readouterr().out
+    assert forbes("evaluate", run, "--acting-samples", 0) == 2
+    assert "--acting-samples" in capsys.readouterr().err
+
+
 def test_an_agent_is_held_against_one_that_is_shown_something_else(tmp_path, capsys):
     """What one is shown changes nothing of what is paid, so the difference has a meaning."""
     task = ("--data.source.task", "tiger", "--trainer.max_epochs", 1)
