@@ -119,7 +119,7 @@ def follow_plan(model: StateSpaceModel, reward: Callable[[Tensor], Tensor], sear
     """
 
     def choose(filtered: Filtered) -> Tensor:
-        turns = -(-search.candidates // len(filtered.hidden))
+        turns = -(-search.candidates // len(filtered.hidden))  # J / K, rounded up
         state, _ = model.posterior.rsample(filtered.context[:, 0], (turns,))  # (J / K, K, D)
         hidden = filtered.hidden[:, 0].expand(turns, -1, -1)  # (J / K, K, H)
         start = State(*(values.flatten(0, 1)[: search.candidates] for values in (hidden, state)))  # (J, H), (J, D)
