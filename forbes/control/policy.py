@@ -65,10 +65,10 @@ def _squeeze(noise: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @fused
-def _bounded(numbers: Tensor) -> tuple[Tensor, Tensor]:
+def _bounded(numbers: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
     """Give mean and standard deviation before the tanh, from (x, y)."""
     mean, std = numbers.chunk(2, -1)  # 2 x (*, A)
-    return 5 * torch.tanh(mean / 5), softplus(std + math.log(math.expm1(5))) + 1e-4
+    return 5 * torch.tanh(mean / 5), softplus(std + math.log(math.expm1(5))) + min_std
 
 
 class OneHotCategorical:
@@ -96,7 +96,7 @@ class OneHotCategorical:
 class Actor(nn.Module):
     r"""The policy q(a | features): a tanh-normal, almost bang-bang at the start (Dreamer, appendix A), of vectors.
 
-    .. math:: \mu = 5 \tanh(x / 5), \qquad \sigma = \mathrm{softplus}(y + \log(e^5 - 1)) + 10^{-4}
+    .. math:: \mu = 5 \tanh(x / 5), \qquad \sigma = \mathrm{softplus}(y + \log(e^5 - 1)) + \sigma_{min}
 
     Args:
         feature_dim: F.
@@ -104,11 +104,20 @@ class Actor(nn.Module):
         width: of each hidden layer.
         layers: hidden layers.
         discrete: an action is one of A, one-hot, and the policy a categorical.
+        min_std: :math:`\sigma_{min}`, 1e-4 in Dreamer.
     """
 
-    def __init__(self, feature_dim: int, action_dim: int, width: int, layers: int, discrete: bool = False) -> None:
+    def __init__(
+        self,
+        feature_dim: int,
+        action_dim: int,
+        width: int,
+        layers: int,
+        discrete: bool = False,
+        min_std: float = 1e-4,
+    ) -> None:
         super().__init__()
-        self.discrete = discrete
+        self.discrete, self.min_std = discrete, min_std
         self.hidden = Perceptron(feature_dim, width, layers)
         self.head = nn.Linear(width, action_dim if discrete else 2 * action_dim)
 
@@ -117,7 +126,7 @@ class Actor(nn.Module):
         numbers: Tensor = self.head(self.hidden(features))
         if self.discrete:
             return OneHotCategorical(numbers)
-        return TanhNormal(*_bounded(numbers))
+        return TanhNormal(*_bounded(numbers, self.min_std))
 
 
 class ScalarHead(nn.Module):

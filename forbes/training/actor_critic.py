@@ -11,6 +11,7 @@ from forbes.control.imagination import belief_samples, frozen
 from forbes.control.policy import Actor, Policy, ScalarHead
 from forbes.control.returns import actor_loss, critic_loss, lambda_returns
 from forbes.data import SequenceBatch
+from forbes.errors import ForbesError
 from forbes.models import Filtered, State
 from forbes.models.networks import activate
 from forbes.training.acting import ActingModel
@@ -49,6 +50,8 @@ class ImaginationActorCritic(ActingModel):
         control_dim: width of actor, critic and reward.
         actor_entropy: :math:`\eta`, the reward of a nat (DreamerV2, arXiv 2010.02193), 0 in paper and Dreamer. With
             it, an actor that a model still wrong has driven to the border of the actions can come back.
+        actor_min_std: :math:`\sigma_{min}` of the actor before its tanh. At Dreamer's 1e-4 an actor that sees no use in
+            straying ends up deterministic, and learns from what it already does; DreamerV2's is 0.1.
         continuation: learn where episodes end; needed where they end by themselves, not by a time limit.
         actor_layers: hidden layers of the actor.
         critic_layers: hidden layers of the critic.
@@ -68,6 +71,7 @@ class ImaginationActorCritic(ActingModel):
         lambda_: float = 0.95,
         control_dim: int = 200,
         actor_entropy: float = 0.0,
+        actor_min_std: float = 1e-4,
         continuation: bool = False,
         actor_layers: int = 2,
         critic_layers: int = 2,
@@ -80,8 +84,10 @@ class ImaginationActorCritic(ActingModel):
         require_at_least(1, name, trajectories=trajectories, actor_layers=actor_layers, critic_layers=critic_layers)
         require_at_least(2, name, horizon=horizon)
         require_at_least(0, name, actor_rate=actor_rate, critic_rate=critic_rate, actor_entropy=actor_entropy)
+        if not actor_min_std > 0:
+            raise ForbesError(f"{name}: actor_min_std is {actor_min_std}, expected a number above 0. 1e-4 is Dreamer's")
         features = self.model.hidden_dim + self.model.state_dim
-        self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers, self.discrete)
+        self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers, self.discrete, actor_min_std)
         self.critic = ScalarHead(features, control_dim, critic_layers)
         self.continues = ScalarHead(features, control_dim, self.reward_layers) if continuation else None
         for network in filter(None, (self.actor, self.critic, self.continues)):
