@@ -4,6 +4,7 @@ The process is spawned, never forked: OpenGL contexts do not survive a fork, and
 on a GPU can hang it. Numbers travel as numpy, and torch is not imported there unless the environment does it.
 """
 
+import atexit
 import multiprocessing
 import os
 import signal
@@ -91,6 +92,7 @@ class EnvironmentProcess(Environment):
             self._process.join()
             self._connection.close()
             self._process = None
+            atexit.unregister(self.close)
 
     def __enter__(self) -> Self:
         return self
@@ -107,6 +109,7 @@ class EnvironmentProcess(Environment):
         self._connection, theirs = spawn.Pipe()
         self._process = spawn.Process(target=_serve, args=(theirs, self._make), daemon=True)
         self._process.start()
+        atexit.register(self.close)  # multiprocessing would ask it to end, which it leaves to its parent, and wait
         theirs.close()  # so that the end of the process is the end of the pipe
         facts: _Facts = self._receive("start", START_LIMIT)
         self.observation_shape, self.action_dim, self.discrete, self.action_repeat, self._description = facts

@@ -53,7 +53,9 @@ def is_agent(run: str) -> bool:
     return isinstance(module, ActingModel)
 
 
-def evaluate_agents(runs: Sequence[str], episodes: int, samples: int, seed: int, device: str, command: str) -> None:
+def evaluate_agents(
+    runs: Sequence[str], episodes: int, samples: int | None, seed: int, device: str, command: str
+) -> None:
     """Let every agent play the same episodes, record its returns in its run folder, and print a table.
 
     Episode k of every run is reset with the same seed, none of which was used in a training. The action is the policy's
@@ -62,7 +64,7 @@ def evaluate_agents(runs: Sequence[str], episodes: int, samples: int, seed: int,
     Args:
         runs: run folders.
         episodes: E, at least 2.
-        samples: K, trajectories of the belief that each action is chosen by.
+        samples: K, trajectories of the belief that each action is chosen by; None for the agent's own.
         seed: of the episodes.
         device: of the models.
         command: for the record.
@@ -72,20 +74,20 @@ def evaluate_agents(runs: Sequence[str], episodes: int, samples: int, seed: int,
     """
     if episodes < 2:
         raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
-    tag, played = f"episodes={episodes}{'' if samples == 1 else f',K={samples}'}", list[_Played]()
+    played = list[_Played]()
     for run in runs:
-        with loaded_agent(run, device) as (agent, environment):
+        with loaded_agent(run, device, samples) as (agent, environment):
             for first in played[:1]:
                 _require_same_task(first, run, describe_environment(environment))
-            played.append(_play(run, agent, environment, episodes, samples, seed))
-        _record(played[-1], tag, seed, command)
-    _print(played, f"return[{tag}]")
+            played.append(_play(run, agent, environment, episodes, seed))
+        _record(played[-1], seed, command)
+    _print(played)
 
 
-def _play(run: str, agent: ActingModel, environment: Environment, episodes: int, samples: int, seed: int) -> _Played:
+def _play(run: str, agent: ActingModel, environment: Environment, episodes: int, seed: int) -> _Played:
     returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
     for number in _counted(run, episodes):
-        episode = play_test_episode(agent, environment, seed, number, samples)
+        episode = play_test_episode(agent, environment, seed, number)
         returns.append(episode.total_reward)
         rewards.append(torch.from_numpy(episode.reward[1:]).double())  # (T,)
         draws = derive_seed(seed, "foresight", number)
@@ -94,7 +96,7 @@ def _play(run: str, agent: ActingModel, environment: Environment, episodes: int,
     return _Played(run, agent, total, explained(foretold, rewards), describe_environment(environment))
 
 
-def _record(one: _Played, tag: str, seed: int, command: str) -> None:
+def _record(one: _Played, seed: int, command: str) -> None:
     measured = {
         "checkpoint": RunFolder(one.run).checkpoint_sha256(),
         "command": command,
@@ -108,6 +110,8 @@ def _record(one: _Played, tag: str, seed: int, command: str) -> None:
         "returns": one.returns.tolist(),
         "environment": one.environment,
     }
+    samples = one.agent.acting_samples
+    tag = f"episodes={len(one.returns)}{'' if samples == 1 else f',K={samples}'}"
     shares = {
         f"reward_explained[ahead={distance},S={SAMPLES},{tag}]": share._asdict() | measured
         for distance, share in zip(STEPS_AHEAD, one.explained, strict=True)
@@ -117,11 +121,9 @@ def _record(one: _Played, tag: str, seed: int, command: str) -> None:
     write_record(one.run, {name: entry | measured} | shares, {name: one.returns})
 
 
-def play_test_episode(
-    agent: ActingModel, environment: Environment, seed: int, number: int, samples: int = 1
-) -> Episode:
+def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int) -> Episode:
     """Play an episode of a test, which was not in the training: for every agent, the same seed is the same episode."""
-    return play_measured(agent, environment, "test episode", seed, number, samples)
+    return play_measured(agent, environment, "test episode", seed, number)
 
 
 def add_acting_samples(parser: ArgumentParser) -> None:
@@ -129,8 +131,8 @@ def add_acting_samples(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--acting-samples",
         type=positive,
-        default=1,
-        help="trajectories of its belief whose mean action an agent takes (default: 1, as in the paper)",
+        metavar="K",
+        help="trajectories of its belief whose mean action an agent takes (default: as it was trained, 1 in the paper)",
     )
 
 
@@ -150,16 +152,18 @@ def _require_same_task(first: _Played, run: str, task: dict[str, Any]) -> None:
         )
 
 
-def _print(played: Sequence[_Played], name: str) -> None:
+def _print(played: Sequence[_Played]) -> None:
     console = Console(width=None if sys.stdout.isatty() else 160)
-    table = Table(title=f"{escape(name)}: undiscounted, mean ± standard error over episodes; the same episodes for all")
-    for header in ("run", "agent", "parameters", "return", "lowest", "highest"):
+    episodes, how = len(played[0].returns), "undiscounted, mean ± standard error; the same episodes for all"
+    table = Table(title=f"return in {episodes} episodes, by the mean action of K trajectories of the belief: {how}")
+    for header in ("run", "agent", "parameters", "K", "return", "lowest", "highest"):
         table.add_column(header, overflow="fold", justify="left" if header in ("run", "agent") else "right")
     for one in played:
         size = sum(parameter.numel() for parameter in one.agent.parameters())
         ends = (f"{end.item():.1f}" for end in (one.returns.min(), one.returns.max()))
         kind = f"{type(one.agent).__name__}, {type(one.agent.model.posterior).__name__}"
-        table.add_row(escape(one.run), kind, f"{size:,}", str(Estimate.of(one.returns)), *ends)
+        samples = str(one.agent.acting_samples)
+        table.add_row(escape(one.run), kind, f"{size:,}", samples, str(Estimate.of(one.returns)), *ends)
     console.print(table)
     console.print(_foresight(played))
     for first, second in itertools.combinations(played, 2):

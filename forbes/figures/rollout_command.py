@@ -33,11 +33,11 @@ def main(argv: Sequence[str]) -> None:
             f"--video {args.video}: it ends in {args.video.suffix or 'nothing'}, expected .gif. Rename it"
         )
     frames = []
-    with loaded_agent(args.run, find_device(args.device)) as (agent, environment):
+    with loaded_agent(args.run, find_device(args.device), args.acting_samples) as (agent, environment):
         remedy = f"Train on pixels; the return is told by: forbes evaluate {args.run}"
         require_images(args.run, environment.observation_shape, remedy)
         for number in range(args.episodes):
-            episode = play_test_episode(agent, environment, args.seed, number, args.acting_samples)
+            episode = play_test_episode(agent, environment, args.seed, number)
             steps = f"{len(episode.reward) - 1:,} agent steps, {episode.frames:,} env steps"
             print(f"episode {number + 1}: return {episode.total_reward:.2f}, {steps}", flush=True)
             frames.append(episode.observation)

@@ -18,6 +18,8 @@ class Likelihood(ABC):
     """A density of the observation given the decoder's output. Its name is part of the name of every metric."""
 
     name: str
+    rank: int
+    """Dimensions of an observation: 3 of an image `(C, H, W)`, 1 of a vector `(O,)`."""
 
     @abstractmethod
     def target(self, observation: Tensor) -> Tensor:
@@ -43,7 +45,7 @@ class Likelihood(ABC):
 class Bernoulli(Likelihood):
     r"""Binary pixels with the output u as logit: :math:`\log p(x) = \sum x u - \mathrm{softplus}(u)`."""
 
-    name = "bernoulli"
+    name, rank = "bernoulli", 3
 
     def target(self, observation: Tensor) -> Tensor:
         """See `Likelihood.target`: 0/1 as they are."""
@@ -78,6 +80,8 @@ class Normal(Likelihood):
     Raises:
         ForbesError: when `bits` is not of 1 to 8, or below 8 for another scale than 255.
     """
+
+    rank = 3
 
     def __init__(self, std: float = 1.0, scale: float = 255.0, bits: int = 8) -> None:
         if not 1 <= bits <= 8 or (bits < 8 and scale != 255):
@@ -118,6 +122,8 @@ class VectorNormal(Likelihood):
         std: :math:`\sigma`; the sensor's, where it is known.
     """
 
+    rank = 1
+
     def __init__(self, std: float = 1.0) -> None:
         self.std = std
         self.name = f"normal({std:g})"
@@ -142,7 +148,7 @@ class VectorNormal(Likelihood):
 class OneHot(Likelihood):
     r"""One of O symbols as a one-hot vector, with the output u as logits: :math:`\log p(x) = \log softmax(u)_x`."""
 
-    name = "categorical"
+    name, rank = "categorical", 1
 
     def target(self, observation: Tensor) -> Tensor:
         """See `Likelihood.target`: as they are."""

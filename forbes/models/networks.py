@@ -150,6 +150,16 @@ class MLPDecoder(Decoder):
         return output.view(-1, *self.observation_shape)  # (N, *O)
 
 
+def _image_size(observation_shape: tuple[int, ...], role: str) -> tuple[int, int]:
+    """Give channels and pixels a side, or raise a ForbesError where observations are no images."""
+    if len(observation_shape) != 3:
+        raise ForbesError(
+            f"Conv{role}: found observations of shape {(*observation_shape,)}, expected images (C, H, W). "
+            f"Use MLP{role} as model.{role.lower()}"
+        )
+    return observation_shape[:2]
+
+
 class ConvEncoder(Encoder):
     """Dreamer's encoder: convolutions of kernel 4 and stride 2 until fewer than 4 pixels are left.
 
@@ -158,11 +168,14 @@ class ConvEncoder(Encoder):
     Args:
         observation_shape: (C, H, W).
         channels: of the first layer; each further layer has twice as many.
+
+    Raises:
+        ForbesError: for vectors.
     """
 
     def __init__(self, observation_shape: tuple[int, ...], channels: int = 32) -> None:
         super().__init__()
-        depth, size, _ = observation_shape
+        depth, size = _image_size(observation_shape, "Encoder")
         blocks: list[nn.Module] = []
         while size >= 4:
             blocks += [nn.Conv2d(depth, channels, 4, stride=2), nn.ReLU()]
@@ -188,7 +201,7 @@ class ConvDecoder(Decoder):
         output_bias: the output it starts from, see `MLPDecoder`.
 
     Raises:
-        ForbesError: for another size.
+        ForbesError: for another size, or vectors.
     """
 
     kernels: ClassVar = {64: (5, 5, 6, 6), 28: (5, 5, 4)}
@@ -197,7 +210,7 @@ class ConvDecoder(Decoder):
         self, feature_dim: int, observation_shape: tuple[int, ...], channels: int = 32, output_bias: float = 0.0
     ) -> None:
         super().__init__()
-        depth, size, _ = observation_shape
+        depth, size = _image_size(observation_shape, "Decoder")
         if size not in self.kernels:
             raise ForbesError(f"ConvDecoder: observations have {size} pixels, expected 28 or 64. Use MLPDecoder")
         kernels = self.kernels[size]

@@ -34,6 +34,8 @@ class ActingModel(WorldModel, ABC):
         exploration: standard deviation of the noise on the actions of collected episodes; where actions are discrete,
             how often one of them is any.
         discrete: an action is one of A, one-hot; the command line takes it from the data.
+        acting_samples: K, trajectories of its belief whose mean action it takes (`Agent`), 1 in the paper; more can be
+            asked for after a training too.
         **world: arguments of `WorldModel`.
 
     Raises:
@@ -47,11 +49,12 @@ class ActingModel(WorldModel, ABC):
         reward_std: float = 1.0,
         exploration: float = 0.3,
         discrete: bool = False,
+        acting_samples: int = 1,
         **world: Any,
     ) -> None:
         super().__init__(**world)
         name = type(self).__name__
-        require_at_least(1, name, control_dim=control_dim, reward_layers=reward_layers)
+        require_at_least(1, name, control_dim=control_dim, reward_layers=reward_layers, acting_samples=acting_samples)
         require_at_least(0, name, exploration=exploration)
         if not reward_std > 0:
             raise ForbesError(f"{name}: reward_std is {reward_std}, expected a number above 0. 1 is Dreamer's")
@@ -64,7 +67,7 @@ class ActingModel(WorldModel, ABC):
             raise ForbesError(
                 f"{name}: the data have no actions, expected some. Choose another source, or a WorldModel"
             )
-        self.exploration, self.discrete = exploration, discrete
+        self.exploration, self.discrete, self.acting_samples = exploration, discrete, acting_samples
         self.reward_std, self.reward_layers = reward_std, reward_layers
         self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, reward_layers)
         activate(self.reward, self.activation)
@@ -107,8 +110,6 @@ class Acting:
 
     agent: ActingModel
     exploring: bool
-    samples: int = 1
-    """Trajectories of the belief that an action is chosen by."""
 
     @classmethod
     def as_it_is(cls, agent: ActingModel, exploring: bool) -> Self:
@@ -117,12 +118,10 @@ class Acting:
 
     def __call__(self, environment: Environment, seed: int) -> Agent:
         """See `MakePolicy`."""
-        return Agent(self.agent.model, self.agent.choose(self.exploring), seed, self.samples)
+        return Agent(self.agent.model, self.agent.choose(self.exploring), seed, self.agent.acting_samples)
 
 
-def play_measured(
-    agent: ActingModel, environment: Environment, purpose: str, seed: int, number: int, samples: int = 1
-) -> Episode:
+def play_measured(agent: ActingModel, environment: Environment, purpose: str, seed: int, number: int) -> Episode:
     """Play an episode without exploration; it is a function of purpose, seed, number and the weights.
 
     Args:
@@ -131,9 +130,8 @@ def play_measured(
         purpose: keeps these episodes apart from all others of the same seed.
         seed: of the measurement.
         number: of the episode.
-        samples: see `Acting`.
 
     Raises:
         ForbesError: where it breaks three times.
     """
-    return play_whole(environment, Acting(agent, False, samples), episode_seed(seed, number, purpose), number)
+    return play_whole(environment, Acting(agent, exploring=False), episode_seed(seed, number, purpose), number)

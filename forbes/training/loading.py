@@ -68,8 +68,13 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
 
 
 @contextmanager
-def loaded_agent(run: str, device: str) -> Iterator[tuple[ActingModel, Environment]]:
+def loaded_agent(run: str, device: str, samples: int | None = None) -> Iterator[tuple[ActingModel, Environment]]:
     """Load a run's agent on a device, with its environment, which is closed at the end.
+
+    Args:
+        run: folder.
+        device: of the model.
+        samples: K, trajectories of its belief that it acts on; None for as many as it was trained with.
 
     Raises:
         ForbesError: where the run is not an agent's.
@@ -79,6 +84,7 @@ def loaded_agent(run: str, device: str) -> Iterator[tuple[ActingModel, Environme
         kind = type(module).__name__
         raise ForbesError(f"{run}: not the run of an agent, but of a {kind}. Name an agent's, or measure it by itself")
     module.to(device)
+    module.acting_samples = samples or module.acting_samples
     try:
         yield module, data.source.environment
     finally:

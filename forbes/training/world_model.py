@@ -66,7 +66,8 @@ class WorldModel(LightningModule):
         seed: of the noise of training and validation.
 
     Raises:
-        ForbesError: when a size is below 1, the learning rate or `clip_norm` below 0, or `center` does not fit.
+        ForbesError: when a size is below 1, the learning rate or `clip_norm` below 0, or `likelihood` or `center` does
+            not fit.
     """
 
     def __init__(
@@ -98,11 +99,13 @@ class WorldModel(LightningModule):
         super().__init__()
         require_at_least(1, "WorldModel", hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers)
         require_at_least(0, "WorldModel", state_dim=state_dim, learning_rate=learning_rate, clip_norm=clip_norm)
+        likelihood = likelihood or Normal()
+        _require_rank(likelihood, observation_shape)
         self.model = model(
             belief,
             encoder(observation_shape),
             decoder(hidden_dim + state_dim, observation_shape),
-            likelihood or Normal(),
+            likelihood,
             action_dim,
             state_dim,
             hidden_dim,
@@ -113,7 +116,7 @@ class WorldModel(LightningModule):
         self.activation: Activation = activation
         activate(self.model, activation)
         if center:
-            _require_mean(self.model.likelihood)
+            _require_mean(likelihood)
             self.model.center = torch.zeros(observation_shape)
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.learning_rate, self.schedule, self.warmup = learning_rate, schedule, warmup
@@ -237,6 +240,17 @@ def follow_rates(module: LightningModule, rates: Sequence[float]) -> None:
     scheduler.base_lrs = [*rates]
     for group, rate, share in zip(scheduler.optimizer.param_groups, rates, scheduler.lr_lambdas, strict=True):
         group["lr"] = rate * share(scheduler.last_epoch)
+
+
+def _require_rank(likelihood: Likelihood, observation_shape: tuple[int, ...]) -> None:
+    """Raise a ForbesError where a likelihood would sum over what is no dimension of an observation."""
+    if likelihood.rank != len(observation_shape):
+        kind = {1: "vectors (O,)", 3: "images (C, H, W)"}[likelihood.rank]
+        others = {1: "VectorNormal or OneHot", 3: "Normal or Bernoulli"}.get(len(observation_shape), "your own")
+        raise ForbesError(
+            f"WorldModel: the likelihood {type(likelihood).__name__} is of {kind}, found observations of shape "
+            f"{(*observation_shape,)}. Choose {others} as model.likelihood"
+        )
 
 
 def _require_mean(likelihood: Likelihood) -> None:

@@ -89,6 +89,26 @@ def test_an_error_that_a_user_can_mend_is_not_tried_again():
     assert "Traceback" in "".join(error.value.__notes__)  # for --debug
 
 
+def test_a_script_that_forgets_to_close_it_ends_all_the_same(tmp_path):
+    """At its exit it would wait for a process that leaves every request to end to its parent."""
+    program = """
+from toy_environments import Echo
+from forbes.envs import EnvironmentProcess
+if __name__ == "__main__":
+    environment = EnvironmentProcess(Echo)
+    raise SystemExit("refused")
+"""
+    (tmp_path / "script.py").write_text(program)
+    paths = os.pathsep.join(path for path in sys.path if path)
+    command = [sys.executable, str(tmp_path / "script.py")]
+
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": paths}, timeout=100, check=False
+    )
+
+    assert (done.returncode, done.stderr.strip()) == (1, "refused")
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_it_ends_with_its_parent_even_within_a_step_that_never_returns(tmp_path):
     program = """

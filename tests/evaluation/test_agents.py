@@ -7,6 +7,7 @@ import pytest
 from small_agents import fit, forbes, write_config
 
 from forbes.control.agent import Agent
+from forbes.data.episode_store import EpisodeStore
 from forbes.evaluation.record import read_arrays, read_record
 from forbes.seeding import derive_seed
 from forbes.training.loading import load_run
@@ -65,9 +66,27 @@ def test_acting_on_many_trajectories_is_a_measurement_of_its_own(run, capsys):
     assert len(many) == 3
     assert guess != many
     assert "reward_explained[ahead=1,S=16,episodes=3,K=4]" in record
-    assert "return[episodes=3,K=4]" in capsys.readouterr().out
+    assert "K trajectories" in capsys.readouterr().out
     assert forbes("evaluate", run, "--acting-samples", 0) == 2
     assert "--acting-samples" in capsys.readouterr().err
+
+
+def test_an_agent_trained_on_many_trajectories_explores_and_is_measured_on_them(tmp_path):
+    """Unless another number is asked for."""
+    runs = one, many = tmp_path / "1", tmp_path / "4"
+    for run in runs:
+        samples = ("--model.acting_samples", run.name, "--trainer.max_epochs", 2)
+        assert fit("--config", write_config(tmp_path), *samples, "--run_dir", run) == 0
+
+    earned = [[record.total_reward for record in EpisodeStore(run / "episodes").records.values()] for run in runs]
+    assert earned[0][:2] == earned[1][:2]  # at random
+    assert earned[0][2] != earned[1][2]
+
+    assert forbes("evaluate", one, many, "--episodes", 3) == 0
+    assert forbes("evaluate", many, "--episodes", 3, "--acting-samples", 1) == 0
+    assert NAME in read_record(str(one))
+    guess, own = (read_record(str(many))[name]["returns"] for name in (NAME, "return[episodes=3,K=4]"))
+    assert guess != own
 
 
 def test_an_agent_is_held_against_one_that_is_shown_something_else(tmp_path, capsys):

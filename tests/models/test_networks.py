@@ -70,3 +70,11 @@ def test_perceptron_ends_with_its_activation(activation, lowest):
 
     assert output.shape == (100, 5)
     assert output.min() == lowest
+
+
+@pytest.mark.parametrize(("network", "sizes"), [(ConvEncoder, ()), (ConvDecoder, (10,))])
+def test_convolutions_are_not_for_vectors(network, sizes):
+    with pytest.raises(
+        ForbesError, match=rf"{network.__name__}: found .* \(5,\), .* Use MLP.*coder as model\..*coder$"
+    ):
+        network(*sizes, (5,))

@@ -12,7 +12,17 @@ from torch.utils.data import DataLoader
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, Normal, ParticleModel, VectorModel, elbo_loss
+from forbes.models import (
+    Bernoulli,
+    MLPDecoder,
+    MLPEncoder,
+    Normal,
+    OneHot,
+    ParticleModel,
+    VectorModel,
+    VectorNormal,
+    elbo_loss,
+)
 from forbes.training import WorldModel
 
 # Lightning 2.6 uses what torch 2.13 deprecates, and has its opinion on loaders without workers.
@@ -206,6 +216,21 @@ def test_the_mean_frame_is_that_of_the_first_batch_and_stays():
 def test_logits_have_no_mean_frame():
     with pytest.raises(ForbesError, match="center with the likelihood Bernoulli, expected Normal or VectorNormal"):
         make_world_model(center=True)
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "shape", "sentence"),
+    [
+        (Normal(), (5,), r"Normal is of images .*, found .* \(5,\)\. Choose VectorNormal or OneHot as model\.likel"),
+        (Bernoulli(), (5,), r"Bernoulli is of images"),
+        (VectorNormal(), (3, 64, 64), r"VectorNormal is of vectors .* \(3, 64, 64\)\. Choose Normal or Bernoulli"),
+        (OneHot(), (4, 5), r"OneHot is of vectors .* Choose your own"),
+    ],
+)
+def test_a_likelihood_that_would_sum_over_sequences_is_refused(likelihood, shape, sentence):
+    """It would be a number for the whole batch, and train without a word."""
+    with pytest.raises(ForbesError, match=sentence):
+        WorldModel(encoder=MLPEncoder, decoder=MLPDecoder, likelihood=likelihood, observation_shape=shape)
 
 
 def test_the_weight_of_the_divergence_rises_to_one():
