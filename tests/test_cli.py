@@ -281,6 +281,7 @@ SHORT_EPISODES = {  # what an agent's configuration spends on playing
 OVERLAYS = {
     "debug.yaml": "strokes/forbes.yaml",
     "dmc/cpu.yaml": "dmc/dreamer.yaml",
+    "dmc/proprio.yaml": "dmc/forbes_n1.yaml",
     "dmc/world_model_cpu.yaml": "dmc/world_model_rssm.yaml",
 }
 
@@ -305,7 +306,8 @@ def test_every_configuration_trains(config, in_tmp_path, screens):
     elsewhere = {"data.source.origin": "bundled"} if "origin: dejong" in text else {}  # it is not in the repository
     if name.startswith("dmc/"):
         elsewhere = {"data.length": 6, "trainer.max_epochs": 2}
-        elsewhere |= {"data.source.path": screens} if "world_model" in name else {"data.source.task": "Screen"}
+        task = "Screen" if "pixels: false" not in text else "cartpole_balance"
+        elsewhere |= {"data.source.path": screens} if "world_model" in name else {"data.source.task": task}
         elsewhere |= {"model.candidates": 20, "model.best": 5} if "PlanningAgent" in text else {}
     small = {
         "data.batch_size": 4,
