@@ -71,7 +71,7 @@ def take_mode(actor: Actor) -> Choice:
 
 
 def explore(actor: Actor, amount: float) -> Choice:
-    """Draw from the policy, and stray from it: how Dreamer collects.
+    """Draw from the policy, and stray from it: how Dreamer collects. Of K trajectories, what their draws agree on.
 
     Args:
         actor: chooses.
