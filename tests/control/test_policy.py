@@ -121,3 +121,11 @@ def test_shapes(shape, discrete):
     assert policy.mode().shape == (*shape, 2)
     assert TanhNormal(torch.zeros(*shape, 2), torch.ones(*shape, 2)).rsample((5,))[0].shape == (5, *shape, 2)
     assert ScalarHead(6, 8, 1)(features).shape == shape
+
+
+@pytest.mark.parametrize("floor", [1e-4, 0.1])
+def test_the_actor_strays_as_far_as_its_floor_where_it_would_rather_not(floor):
+    actor = Actor(6, 2, 32, 2, min_std=floor)
+    torch.nn.init.constant_(actor.head.bias, -1000.0)
+
+    torch.testing.assert_close(actor(torch.zeros(5, 6)).std, torch.full((5, 2), floor))
