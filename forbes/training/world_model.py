@@ -245,11 +245,10 @@ def follow_rates(module: LightningModule, rates: Sequence[float]) -> None:
 def _require_rank(likelihood: Likelihood, observation_shape: tuple[int, ...]) -> None:
     """Raise a ForbesError where a likelihood would sum over what is no dimension of an observation."""
     if likelihood.rank != len(observation_shape):
-        kind = {1: "vectors (O,)", 3: "images (C, H, W)"}[likelihood.rank]
         others = {1: "VectorNormal or OneHot", 3: "Normal or Bernoulli"}.get(len(observation_shape), "your own")
         raise ForbesError(
-            f"WorldModel: the likelihood {type(likelihood).__name__} is of {kind}, found observations of shape "
-            f"{(*observation_shape,)}. Choose {others} as model.likelihood"
+            f"WorldModel: the likelihood {type(likelihood).__name__} is of observations of rank {likelihood.rank}, "
+            f"found shape {(*observation_shape,)}. Choose {others} as model.likelihood"
         )
 
 

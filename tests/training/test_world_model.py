@@ -221,10 +221,14 @@ def test_logits_have_no_mean_frame():
 @pytest.mark.parametrize(
     ("likelihood", "shape", "sentence"),
     [
-        (Normal(), (5,), r"Normal is of images .*, found .* \(5,\)\. Choose VectorNormal or OneHot as model\.likel"),
-        (Bernoulli(), (5,), r"Bernoulli is of images"),
-        (VectorNormal(), (3, 64, 64), r"VectorNormal is of vectors .* \(3, 64, 64\)\. Choose Normal or Bernoulli"),
-        (OneHot(), (4, 5), r"OneHot is of vectors .* Choose your own"),
+        (
+            Normal(),
+            (5,),
+            r"Normal is of .* rank 3, found shape \(5,\)\. Choose VectorNormal or OneHot as model.likelihood",
+        ),
+        (Bernoulli(), (5,), r"Bernoulli is of .* rank 3"),
+        (VectorNormal(), (3, 64, 64), r"VectorNormal is of .* rank 1, .* \(3, 64, 64\)\. Choose Normal or Bernoulli"),
+        (OneHot(), (4, 5), r"OneHot is of .* rank 1, .* Choose your own"),
     ],
 )
 def test_a_likelihood_that_would_sum_over_sequences_is_refused(likelihood, shape, sentence):
