@@ -67,7 +67,7 @@ own episodes by heart, or where rewards hardly vary. Both are kept as each agent
 
 With --acting-samples 32 an agent takes the mean action of 32 trajectories of its belief (of discrete actions the
 commonest), not that of one, which is the paper's: no training is needed for it, and where an observation tells little
-it can be worth much.
+it can be worth much, or cost as much.
 
 On digit strokes and one core, elbo takes some 4 minutes a run, pll 5, fivo 3, and open-loop 20, in proportion to
 --futures and --digits."""

@@ -89,22 +89,20 @@ def test_an_error_that_a_user_can_mend_is_not_tried_again():
     assert "Traceback" in "".join(error.value.__notes__)  # for --debug
 
 
+def run_script(folder, text):
+    (folder / "script.py").write_text("from forbes.envs import EnvironmentProcess, find_environment\n" + text)
+    command = [sys.executable, str(folder / "script.py")]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
 def test_a_script_that_forgets_to_close_it_ends_all_the_same(tmp_path):
     """At its exit it would wait for a process that leaves every request to end to its parent."""
-    program = """
-from toy_environments import Echo
-from forbes.envs import EnvironmentProcess
+    guarded = """
 if __name__ == "__main__":
-    environment = EnvironmentProcess(Echo)
+    environment = EnvironmentProcess(find_environment("tiger"))
     raise SystemExit("refused")
 """
-    (tmp_path / "script.py").write_text(program)
-    paths = os.pathsep.join(path for path in sys.path if path)
-    command = [sys.executable, str(tmp_path / "script.py")]
-
-    done = subprocess.run(
-        command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": paths}, timeout=100, check=False
-    )
+    done = run_script(tmp_path, guarded)
 
     assert (done.returncode, done.stderr.strip()) == (1, "refused")
 
@@ -146,12 +144,7 @@ if __name__ == "__main__":
 
 def test_a_script_without_a_guard_is_told_what_it_lacks(tmp_path):
     """A spawned process imports the script that started it, which would start another one, and so on."""
-    script = tmp_path / "script.py"
-    script.write_text(
-        "from forbes.envs import EnvironmentProcess, find_environment\nEnvironmentProcess(find_environment('tiger'))\n"
-    )
-
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=120)
+    done = run_script(tmp_path, "EnvironmentProcess(find_environment('tiger'))\n")
 
     assert done.returncode != 0
     assert 'keep its commands under `if __name__ == "__main__":`' in done.stderr.splitlines()[-1]
