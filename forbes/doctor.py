@@ -3,6 +3,7 @@
 import os
 import platform
 import shutil
+import subprocess
 from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -73,14 +74,26 @@ def _hardware() -> Iterator[Finding]:
     yield Finding(
         "processors", f"{cpus}, torch uses {threads} threads", "set OMP_NUM_THREADS" if threads > cpus else ""
     )
-    if torch.cuda.is_available():
-        yield Finding("GPU", torch.cuda.get_device_name())
-    else:
-        yield Finding("GPU", "none that torch can use (optional)")
+    yield from _gpus()
     free = shutil.disk_usage(".").free / 2**30
     yield Finding(
         "free disk", f"{free:.1f} GiB here", "make room: a run takes up to 0.1 GiB" if free < 1 else "", free < 0.1
     )
+
+
+def _gpus() -> Iterator[Finding]:
+    """Name every GPU that torch can use, and the driver, which may be there without one."""
+    for number in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(number)
+        yield Finding(f"GPU {number}", f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB")
+    if not torch.cuda.is_available():
+        yield Finding("GPU", "none that torch can use (optional)")
+    if program := shutil.which("nvidia-smi"):
+        asked = [program, "--query-gpu=driver_version", "--format=csv,noheader"]
+        answer = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=30)
+        said = (answer.stdout.strip() or answer.stderr.strip() or "no answer").splitlines()[0]
+        remedy = "" if torch.cuda.is_available() else "install torch for CUDA, if there is a GPU (https://pytorch.org)"
+        yield Finding("GPU driver", f"{said}; torch is built for CUDA {torch.version.cuda or 'none'}", remedy)
 
 
 def _rendering() -> Iterator[Finding]:

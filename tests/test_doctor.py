@@ -1,6 +1,9 @@
 """The doctor finds what is missing, and says what to do."""
 
+from types import SimpleNamespace
+
 import pytest
+import torch
 
 from forbes.cli import main
 from forbes.envs.rendering import Probe
@@ -30,6 +33,31 @@ def test_missing_data_are_named_with_their_remedy(capsys, monkeypatch, tmp_path)
     assert main(["doctor"]) == 1
 
     assert "forbes data build-strokes" in capsys.readouterr().out
+
+
+def test_every_gpu_and_the_driver_are_named(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(
+        torch.cuda, "get_device_properties", lambda n: SimpleNamespace(name="H", total_memory=n * 2**33)
+    )
+    program = tmp_path / "nvidia-smi"
+    program.write_text("#!/bin/sh\necho 570.12\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("forbes.doctor.shutil.which", lambda _: str(program))
+
+    assert main(["doctor"]) == 0
+
+    output = capsys.readouterr().out
+    assert "H, 0 GiB" in output
+    assert "H, 8 GiB" in output
+    assert "570.12; torch is built for CUDA" in output
+    assert "install torch for CUDA" not in output
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main(["doctor"]) == 0
+    assert "install torch for CUDA" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("argument", ["surplus", "--unknown"])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from forbes.envs.base import Environment, Step
+from forbes.envs.control import DeepMindControl
 
 
 class Echo(Environment):
@@ -81,6 +82,23 @@ class Troubled(Echo):
 
     def sees_doubles(self, step):
         return step._replace(observation=np.zeros(2))
+
+
+class Unready(Echo):
+    """An echo that raises or hangs where it is built, or at a reset."""
+
+    def __init__(self, where, trouble):
+        super().__init__()
+        self.where, self.trouble = where, trouble
+        self.begin("start")
+
+    def reset(self, seed):
+        self.begin("reset")
+        return super().reset(seed)
+
+    def begin(self, where):
+        if where == self.where:
+            getattr(Troubled, self.trouble)(self, None)
 
 
 class Weary(Troubled):
@@ -163,3 +181,11 @@ class Slide(Environment):
 
     def describe(self):
         return {"task": "Slide", "steps": self.steps}
+
+
+class Measured(DeepMindControl):
+    """Says how large the buffer is that it renders into."""
+
+    def describe(self):
+        buffer = self._environment.physics.model.vis.global_
+        return {"task": self.task, "buffer": [buffer.offwidth, buffer.offheight]}

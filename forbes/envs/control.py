@@ -18,6 +18,8 @@ __all__ = ["DeepMindControl"]
 
 _NO_RENDERING = "disable"
 """The value of MUJOCO_GL with which dm_control loads no backend."""
+_NO_BOUND = 1e10
+"""MuJoCo's largest number, which the suite gives where an actuator has no bound."""
 
 
 class DeepMindControl(Environment):
@@ -27,7 +29,8 @@ class DeepMindControl(Environment):
 
     .. math:: r_{t+1} = \sum_{i=1}^{R} r(s_{t,i}, a_t)
 
-    The time limit of 1000 frames is a truncation; the suite says so by a discount of 1. Defaults are those of Dreamer
+    The time limit of 1000 frames is a truncation; the suite says so by a discount of 1. The two tasks without one,
+    `lqr`, have actions without bounds, and are refused. Defaults are those of Dreamer
     (arXiv 1912.01603): two frames, 64 x 64 pixels, camera 0, of the quadruped 2.
 
     Args:
@@ -41,7 +44,7 @@ class DeepMindControl(Environment):
         backend: of OpenGL, proved to render; by default the one that `choose_backend` proves.
 
     Raises:
-        ForbesError: for an unknown task or camera, or when nothing renders.
+        ForbesError: for an unknown task or camera, one without bounds of its actions, or when nothing renders.
     """
 
     def __init__(
@@ -60,6 +63,10 @@ class DeepMindControl(Environment):
         self._environment = _load(task, self.backend)
         spec = self._environment.action_spec()
         self._low, self._high, self.action_dim = spec.minimum, spec.maximum, spec.shape[0]
+        if (self._high >= _NO_BOUND).any():
+            raise ForbesError(
+                f"{task}: its actions have no bounds that [-1, 1] could be scaled to. Choose another task"
+            )
         self.camera = camera if camera is not None else 2 if task.startswith("quadruped") else 0
         self.observation_shape = (3, size, size) if pixels else self.reset(0).observation.shape
         if pixels:
@@ -96,7 +103,7 @@ class DeepMindControl(Environment):
         if not self.pixels:
             return np.concatenate([np.ravel(part) for part in time_step.observation.values()]).astype(np.float32)
         frame = self._environment.physics.render(self.size, self.size, camera_id=self.camera)  # (H, W, 3)
-        if frame.min() == frame.max():
+        if (frame == frame[0, 0]).all():
             raise RuntimeError(f"{self.backend} renders a frame of one colour")
         return np.ascontiguousarray(frame.transpose(2, 0, 1))  # (3, H, W)
 

@@ -22,7 +22,8 @@ class Gymnasium(Environment):
 
     Args:
         task: the id.
-        pixels: observe uint8 `(3, size, size)`.
+        pixels: observe uint8 `(3, size, size)`. The environment itself chooses what draws: those of MuJoCo read
+            MUJOCO_GL, for which `forbes doctor` says what works here.
         action_repeat: steps of Gymnasium for which an action is held; their rewards add up.
         size: pixels a side.
 

@@ -87,7 +87,7 @@ def choose_backend() -> Probe:
             return probes[-1]
     problems = "; ".join(f"{probe.backend}: {probe.problem}" for probe in probes)
     raise ForbesError(
-        f"rendering: {'MUJOCO_GL=' + asked if asked else 'no backend'} gives no picture ({problems}). `forbes doctor` "
+        f"rendering: {'MUJOCO_GL=' + asked + ' gives no' if asked else 'no backend gives a'} picture ({problems}). `forbes doctor` "
         "has the remedy; vectors need no rendering: --no-pixels"
     )
 

@@ -102,7 +102,9 @@ class EnvironmentProcess(Environment):
 
     @property
     def _name(self) -> str:
-        return str(self._description["task"]) if hasattr(self, "_description") else "environment"
+        """What errors call it: its task or, until it is built, what builds it."""
+        built = hasattr(self, "_description")
+        return str(self._description["task"] if built else getattr(self._make, "func", self._make).__name__)
 
     def _start(self) -> None:
         spawn = multiprocessing.get_context("spawn")

@@ -1,7 +1,10 @@
 """The DeepMind Control Suite: the same seed is the same episode, and a step is what the suite itself says."""
 
+from functools import partial
+
 import numpy as np
 import pytest
+from toy_environments import Measured
 
 suite = pytest.importorskip("dm_control.suite")
 
@@ -117,12 +120,47 @@ def test_a_pole_thinner_than_a_pixel_is_in_a_fast_frame(backend, seed):
         (("walker_wlak",), "Did you mean walker_walk"),
         (("qqq",), "qqq: no such task. `forbes data collect --help` says what there is"),
         (("cartpole_swingup", False, 0), "cartpole_swingup: action_repeat is 0, expected at least 1"),
+        (
+            ("lqr_lqr_2_1",),
+            "lqr_lqr_2_1: its actions have no bounds that [-1, 1] could be scaled to. Choose another task",
+        ),
     ],
 )
 def test_what_does_not_exist_is_one_sentence(arguments, sentence):
     with pytest.raises(ForbesError) as error:
         DeepMindControl(*arguments, **({"pixels": False} if len(arguments) == 1 else {}))
     assert sentence in str(error.value)
+
+
+class Painted:
+    """A suite's task, as far as its frames go: all of one colour but for what is set in them."""
+
+    def __init__(self, *pixels):
+        self.physics = self
+        self.frame = np.full((64, 64, 3), (0, 0, 200), np.uint8)
+        for pixel in pixels:
+            self.frame[pixel] = 255
+
+    def render(self, height, width, camera_id):
+        return self.frame
+
+
+def test_a_frame_of_one_colour_is_an_error_and_one_other_pixel_is_none():
+    environment = DeepMindControl("cartpole_balance", pixels=False)
+    environment.pixels = True
+
+    environment._environment = Painted((63, 63))
+    assert environment._observe(None)[:, 63, 63].tolist() == [255, 255, 255]
+    environment._environment = Painted()
+    with pytest.raises(RuntimeError, match="renders a frame of one colour"):
+        environment._observe(None)
+
+
+def test_the_buffer_is_as_large_as_the_frame(backend):
+    """MuJoCo's own, of 640 x 480, costs 20 % more."""
+    make = partial(Measured, "cartpole_balance", backend=backend, size=48)
+    with EnvironmentProcess(make) as environment:
+        assert environment.describe()["buffer"] == [48, 48]
 
 
 def test_a_camera_that_does_not_exist_is_one_sentence(backend):

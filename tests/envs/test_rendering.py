@@ -55,7 +55,7 @@ def test_without_a_backend_there_is_one_sentence(unasked, monkeypatch):
     with pytest.raises(ForbesError) as error:
         choose_backend()
     assert str(error.value) == (
-        "rendering: no backend gives no picture (egl: egl is broken; osmesa: osmesa is broken). `forbes doctor` "
+        "rendering: no backend gives a picture (egl: egl is broken; osmesa: osmesa is broken). `forbes doctor` "
         "has the remedy; vectors need no rendering: --no-pixels"
     )
 

@@ -1,5 +1,6 @@
 """The process that owns an environment: whatever happens in it, the parent gets a sentence and the next episode."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -10,9 +11,9 @@ from functools import partial
 import numpy as np
 import pytest
 from processes import ends
-from toy_environments import Echo, Troubled
+from toy_environments import Echo, Troubled, Unready
 
-from forbes.envs import BrokenEnvironmentError, EnvironmentProcess, find_environment
+from forbes.envs import BrokenEnvironmentError, EnvironmentProcess, find_environment, worker
 from forbes.errors import ForbesError
 
 ACTIONS = [np.array([value], np.float32) for value in (0.5, -0.25, 0.125, 1.0, 0.0, -1.0)]
@@ -70,6 +71,24 @@ def test_after_trouble_the_next_reset_starts_anew(trouble, tmp_path):
 
         assert_same(episode(environment), episode(Echo()))
         assert environment.describe()["process"] != first
+
+
+@pytest.mark.parametrize("where", ["start", "reset"])
+@pytest.mark.parametrize("trouble", ["raises", "hangs", "leaves"])
+def test_trouble_before_the_first_step_is_a_sentence_and_leaves_no_process(where, trouble, monkeypatch):
+    monkeypatch.setattr(worker, "START_LIMIT", 3.0 if (where, trouble) == ("start", "hangs") else 60.0)
+    begun = set(multiprocessing.active_children())
+
+    with pytest.raises(BrokenEnvironmentError) as error:
+        EnvironmentProcess(partial(Unready, where, trouble), timeout=3.0).reset(0)
+
+    sentences = {
+        "raises": f"{where} raises ArithmeticError: the physics has exploded",
+        "hangs": f"it hangs, no answer to {where} within 3 s",
+        "leaves": f"its process has died in {where}, exit code 7",
+    }
+    assert str(error.value).startswith(f"{'Unready' if where == 'start' else 'Echo'}: {sentences[trouble]}")
+    assert set(multiprocessing.active_children()) <= begun
 
 
 def test_an_interrupt_leaves_no_answer_behind_that_is_taken_for_another(echo, monkeypatch):
