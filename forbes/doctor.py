@@ -18,6 +18,7 @@ import forbes
 from forbes.arguments import ArgumentParser
 from forbes.data.dejong import dejong_path
 from forbes.data.digit_classifiers import classifiers_path
+from forbes.data.published import curves_path
 from forbes.data.strokes import bundled_path
 from forbes.envs.rendering import BACKENDS, probe_backend
 
@@ -117,6 +118,7 @@ def _data() -> Iterator[Finding]:
         ("strokes, bundled", bundled_path(), "forbes data build-strokes --images DIR", True),
         ("digit classifiers", classifiers_path(), "install forbes again, if you need forbes completions", False),
         ("strokes, de Jong", dejong_path(), "forbes data fetch strokes (optional: the paper's set)", False),
+        ("curves of Dreamer", curves_path(), "forbes data fetch curves (optional: beside an agent's own)", False),
     ):
         found = path.is_file()
         yield Finding(name, str(path) if found else f"no {path}", "" if found else remedy, needed and not found)

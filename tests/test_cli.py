@@ -1,6 +1,7 @@
 """The command line: what it lists, what it leaves behind, and each bad input as one sentence and exit code 2."""
 
 import json
+import math
 import resource
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import yaml
 
 from forbes import __version__
 from forbes.cli import COMMANDS, main
+from forbes.data.episode_store import EpisodeStore
 from forbes.training import WorldModel, configuration
 from forbes.training.run_folder import RunFolder, read_metrics
 
@@ -280,7 +282,7 @@ SHORT_EPISODES = {  # what an agent's configuration spends on playing
 }
 OVERLAYS = {
     "debug.yaml": "strokes/forbes.yaml",
-    "dmc/cpu.yaml": "dmc/dreamer.yaml",
+    "dmc/cpu.yaml": "dmc/forbes_n1.yaml",
     "dmc/proprio.yaml": "dmc/forbes_n1.yaml",
     "dmc/world_model_cpu.yaml": "dmc/world_model_rssm.yaml",
 }
@@ -305,7 +307,7 @@ def test_every_configuration_trains(config, in_tmp_path, screens):
     base = ["--config", f"{CONFIGS}/{OVERLAYS[name]}"] if name in OVERLAYS else []
     elsewhere = {"data.source.origin": "bundled"} if "origin: dejong" in text else {}  # it is not in the repository
     if name.startswith("dmc/"):
-        elsewhere = {"data.length": 6, "trainer.max_epochs": 2}
+        elsewhere = {"data.length": 6}
         task = "Screen" if "pixels: false" not in text else "cartpole_balance"
         elsewhere |= {"data.source.path": screens} if "world_model" in name else {"data.source.task": task}
         elsewhere |= {"model.candidates": 20, "model.best": 5} if "PlanningAgent" in text else {}
@@ -313,7 +315,7 @@ def test_every_configuration_trains(config, in_tmp_path, screens):
         "data.batch_size": 4,
         "data.updates_per_epoch": 1,
         "data.validation_sequences": 4,
-        "trainer.max_epochs": 1,
+        "trainer.max_epochs": 2 if name.startswith("dmc/") or "Experience" in text else 1,  # agents play in the second
         "trainer.log_every_n_steps": 1,
         "trainer.accelerator": "cpu",
     }
@@ -322,3 +324,9 @@ def test_every_configuration_trains(config, in_tmp_path, screens):
     assert main(["fit", *base, "--config", "config.yaml", *flags, "--run_dir", "run", *TOYS]) == 0
 
     assert Path("run/checkpoints/last.ckpt").is_file()
+    logged = [json.loads(line) for line in Path("run/metrics.jsonl").read_text().splitlines()]
+    assert all(math.isfinite(value) for line in logged for value in line.values())
+    if Path("run/episodes").is_dir():
+        policies = [record.policy for record in EpisodeStore("run/episodes").records.values()]
+        assert policies[0] == "random"
+        assert policies[-1] != "random"

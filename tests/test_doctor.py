@@ -39,9 +39,7 @@ def test_every_gpu_and_the_driver_are_named(capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(
-        torch.cuda, "get_device_properties", lambda n: SimpleNamespace(name="H", total_memory=n * 2**33)
-    )
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda n: SimpleNamespace(name="H", total_memory=n << 33))
     program = tmp_path / "nvidia-smi"
     program.write_text("#!/bin/sh\necho 570.12\n")
     program.chmod(0o755)

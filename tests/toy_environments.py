@@ -101,6 +101,21 @@ class Unready(Echo):
             getattr(Troubled, self.trouble)(self, None)
 
 
+class Unbuildable(Unready):
+    """Raises where it is built."""
+
+    def __init__(self):
+        super().__init__("start", "raises")
+
+
+class Hanging(Echo):
+    """Never answers its third action."""
+
+    def step(self, action):
+        step = super().step(action)
+        return Troubled.hangs(self, step) if self.time == 3 else step
+
+
 class Weary(Troubled):
     """Goes wrong in three episodes in a row, after so many healthy ones; `ledger` counts them all."""
 

@@ -19,6 +19,7 @@ from forbes.data.digit_classifiers import CLASSIFIERS_SHA256, classifiers_path, 
 from forbes.data.episode_commands import Add, add_episode_commands
 from forbes.data.fetch import fetch_dejong
 from forbes.data.pictures import save_picture
+from forbes.data.published import curves_path, fetch_curves
 from forbes.data.source import Split
 from forbes.data.stroke_comparison import compare_sets
 from forbes.data.stroke_extraction import extract_strokes, read_mnist
@@ -29,6 +30,7 @@ from forbes.errors import ForbesError
 __all__ = ["build_classifiers", "build_strokes", "compare_strokes", "fetch", "main", "show"]
 
 Dataset = Literal["strokes"]
+Fetched = Literal["strokes", "curves"]
 Origin = Literal["bundled", "dejong"]
 
 _FRAMES = 6
@@ -76,13 +78,18 @@ def build_classifiers(output: Path | None = None) -> None:
     print(f"{output}: {output.stat().st_size} bytes, weights of sha256 {sha256}, {change}")
 
 
-def fetch(dataset: Dataset, from_: Path | None = None) -> None:
-    """Store a dataset that does not come with the package, verified by its hashes.
+def fetch(dataset: Fetched, from_: Path | None = None) -> None:
+    """Store what does not come with the package, verified by its hashes.
 
     Args:
-        dataset: ``strokes``, the paper's stroke set, of Edwin D. de Jong (CC BY-SA 3.0).
-        from_: A local copy instead of a download: the tarball, its extracted folder, or a converted `.npz`.
+        dataset: ``strokes``, the paper's stroke set, of Edwin D. de Jong (CC BY-SA 3.0), or ``curves``, what Dreamer's
+            agents earned on DeepMind Control (MIT).
+        from_: A local copy instead of a download: of strokes the tarball, its extracted folder, or a converted `.npz`.
     """
+    if dataset == "curves":
+        fetch_curves(from_, curves_path())
+        print(f"{curves_path()}: stored; figures/return.png of agents of DeepMind Control has them beside their own")
+        return
     path = dejong_path()
     if from_ is None and path.is_file():
         verify_dejong(load_strokes(path, "Delete it and fetch it again"), path, "Delete it and fetch it again")
@@ -194,8 +201,9 @@ def _parser(more: Sequence[Callable[[Add], None]]) -> argparse.ArgumentParser:
     train.add_argument("-o", "--output", type=Path, help="file to write, by default the bundled one")
 
     get = add("fetch", fetch, "fetch strokes --from sequences.tar.gz")
-    get.add_argument("dataset", choices=get_args(Dataset))
-    get.add_argument("--from", dest="from_", type=Path, metavar="PATH", help="tarball, extracted folder or .npz")
+    get.add_argument("dataset", choices=get_args(Fetched), help="strokes of the paper, or Dreamer's learning curves")
+    of_strokes = "of strokes the tarball, its extracted folder or an .npz"
+    get.add_argument("--from", dest="from_", type=Path, metavar="PATH", help=f"a local copy; {of_strokes}")
 
     compare = add("compare-strokes", compare_strokes, "compare-strokes data/strokes.npz dejong-strokes.npz")
     compare.add_argument("one", type=Path, help="a stroke file")

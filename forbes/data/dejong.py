@@ -1,12 +1,12 @@
 """The paper's stroke set, of Edwin D. de Jong: where it is kept, how it is recognised, and its row format."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from forbes.data.download import data_folder
 from forbes.data.stroke_file import SIDE, StrokeArrays, sha256_of_arrays
 from forbes.errors import ForbesError
 
@@ -26,9 +26,8 @@ DEJONG_SHA256 = {
 
 
 def dejong_path() -> Path:
-    """Where the paper's set is kept: `$FORBES_DATA`, else the user's cache."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "forbes"
-    return Path(os.environ.get("FORBES_DATA") or cache) / "dejong-strokes.npz"
+    """Where the paper's set is kept."""
+    return data_folder() / "dejong-strokes.npz"
 
 
 def verify_dejong(splits: Mapping[str, StrokeArrays], where: Path, remedy: str) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from forbes.data.episode_store import EpisodeStore, EpisodeWriter
 from forbes.data.episodes import EpisodeRecord
 from forbes.data.pictures import draw_strips, save_picture
-from forbes.errors import ForbesError
 
 __all__ = ["Add", "add_episode_commands", "check", "count_steps", "info"]
 
@@ -84,8 +83,7 @@ def check(path: Path) -> int:
 def _opened(path: Path) -> EpisodeStore:
     """Open a store that has episodes."""
     store = EpisodeStore(path)
-    if not store.records:
-        raise ForbesError(f"{path}: there are no episodes. Collect some: forbes data collect --task TASK -o {path}")
+    store.require_episodes()
     return store
 
 

@@ -49,6 +49,15 @@ class EpisodeStore:
         self._open = lru_cache(maxsize=_OPEN_FILES)(self._map)
         self.refresh()
 
+    def require_episodes(self) -> None:
+        """Raise a ForbesError where there are none."""
+        if not self.records:
+            damaged = len([*self.path.glob("quarantine/*.npz")])
+            raise ForbesError(
+                f"{self.path}: there are no episodes{f' but {damaged} in quarantine' if damaged else ''}. "
+                f"Collect some: forbes data collect --task TASK -o {self.path}"
+            )
+
     def refresh(self) -> None:
         """Read the index again: another process may have added to it."""
         self.records: dict[int, EpisodeRecord] = {}

@@ -1,21 +1,17 @@
 """Get the paper's stroke set: download it, or take a local copy, and convert it to a stroke file."""
 
 import gzip
-import hashlib
-import http
-import http.client
 import tarfile
-import urllib.error
-import urllib.request
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, track
+from rich.progress import track
 
 from forbes.data.dejong import parse_digit, verify_dejong
+from forbes.data.download import download, git_blob_id
 from forbes.data.stroke_file import StrokeArrays, check_strokes, load_strokes, save_strokes
 from forbes.errors import ForbesError
 
@@ -23,9 +19,7 @@ __all__ = [
     "DEJONG_BLOB",
     "DEJONG_URL",
     "convert",
-    "download",
     "fetch_dejong",
-    "git_blob_id",
     "read_archive",
     "read_folder",
     "wanted_files",
@@ -36,11 +30,9 @@ DEJONG_BLOB = "33b359bd06060e7e98abffaf74470f0b7310d12b"
 DIGITS = {"train": 60_000, "test": 10_000}
 
 _LOCAL = "Give a local copy with: forbes data fetch strokes --from PATH, or use the origin bundled, which needs none"
-_DOWNLOAD_LIMIT = 100 * 2**20  # bytes; GitHub stores no larger file
 _ARCHIVE_LIMIT = 2**30  # bytes when unpacked; 210,000 small files and their tar headers have less than half
 _DIGIT_LIMIT = 2**14  # bytes of one digit's rows; the longest, of 106 points, has less than 2,000
 _LABELS_LIMIT = 2**20  # bytes; 60,000 lines of one digit
-_CHUNK = 2**16
 
 
 def fetch_dejong(source: Path | None, destination: Path) -> None:
@@ -54,7 +46,7 @@ def fetch_dejong(source: Path | None, destination: Path) -> None:
         splits = _read(source)
     else:
         tarball = destination.with_name("sequences.tar.gz")
-        download(DEJONG_URL, tarball)
+        download(DEJONG_URL, tarball, _LOCAL)
         try:
             splits = _read(tarball)
         finally:
@@ -75,50 +67,6 @@ def _read(source: Path) -> dict[str, StrokeArrays]:
     if found != DEJONG_BLOB:
         raise ForbesError(f"{source}: the git blob id is {found}, expected {DEJONG_BLOB}. {_LOCAL}")
     return convert(read_archive(source, wanted), DIGITS, source)
-
-
-def download(url: str, path: Path) -> None:
-    """Download a file, from where an earlier attempt was interrupted."""
-    part = path.with_name(f"{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        held = part.stat().st_size if part.exists() else 0
-        request = urllib.request.Request(url, headers={"Range": f"bytes={held}-"} if held else {})
-        with urllib.request.urlopen(request, timeout=30) as response:
-            _receive(response, part, url)
-    except urllib.error.HTTPError as error:
-        error.close()
-        if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:  # that is: there is nothing left to send
-            raise ForbesError(f"{url}: could not be downloaded ({error}). {_LOCAL}") from error
-    except (OSError, http.client.HTTPException) as error:
-        raise ForbesError(f"{url}: could not be downloaded ({getattr(error, 'reason', error)}). {_LOCAL}") from error
-    part.replace(path)
-
-
-def _receive(response: http.client.HTTPResponse, part: Path, url: str) -> None:
-    """Write a response's body, behind what is there already if the server agreed to go on from there."""
-    resumed = response.status == http.HTTPStatus.PARTIAL_CONTENT
-    announced = response.headers["Content-Length"]
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with part.open("ab" if resumed else "wb") as file, Progress(*columns) as progress:
-        total = file.tell() + int(announced) if announced else None
-        task = progress.add_task("sequences.tar.gz", total=total, completed=file.tell())
-        while chunk := response.read(_CHUNK):
-            file.write(chunk)
-            progress.update(task, completed=file.tell())
-            if file.tell() > _DOWNLOAD_LIMIT:
-                raise ForbesError(f"{url}: sends more than {_DOWNLOAD_LIMIT} bytes, expected a smaller file. {_LOCAL}")
-        if total is not None and file.tell() < total:
-            raise ForbesError(f"{url}: interrupted after {file.tell()} of {total} bytes. Run it again to go on.")
-
-
-def git_blob_id(path: Path) -> str:
-    """Name a file's content as git does: the SHA-1 of ``blob <size>``, a zero byte and the bytes."""
-    digest = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
 
 
 def wanted_files(digits: Mapping[str, int]) -> dict[str, int]:

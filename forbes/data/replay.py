@@ -74,8 +74,7 @@ class Replay(SequenceSource):
             raise ForbesError(f"Replay: stride is {stride}, expected at least 1")
         self.path, self.capacity, self.hold_out, self.stride = path, capacity, hold_out, stride
         self.store = EpisodeStore(path)
-        if not self.store.records:
-            raise ForbesError(f"{path}: there are no episodes. Collect some: forbes data collect --task TASK -o {path}")
+        self.store.require_episodes()
         self._watermark = self.store.watermark
         environment = next(iter(self.store.records.values())).environment
         self.observation_shape: tuple[int, ...] = tuple(environment["observation_shape"])

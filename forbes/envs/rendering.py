@@ -86,9 +86,9 @@ def choose_backend() -> Probe:
         if not probes[-1].problem:
             return probes[-1]
     problems = "; ".join(f"{probe.backend}: {probe.problem}" for probe in probes)
+    failure = f"MUJOCO_GL={asked} gives no picture" if asked else "no backend gives a picture"
     raise ForbesError(
-        f"rendering: {'MUJOCO_GL=' + asked + ' gives no' if asked else 'no backend gives a'} picture ({problems}). `forbes doctor` "
-        "has the remedy; vectors need no rendering: --no-pixels"
+        f"rendering: {failure} ({problems}). `forbes doctor` has the remedy; vectors need no rendering: --no-pixels"
     )
 
 

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from forbes.data.published import curves_path
 from forbes.errors import ForbesError
 from forbes.figures.style import COLUMN, GREY, ORANGE, PALETTE, draw_range, paper_style
 
@@ -66,22 +67,25 @@ def _label(axes: Axes, task: str, end: float) -> None:
     axes.legend(loc="best")
 
 
-def published_curves(path: str, task: str) -> dict[str, list[pd.Series]]:
+def published_curves(path: str | None, task: str) -> dict[str, list[pd.Series]]:
     """Read the curves of a task: by method, one for each seed, returns against env steps.
 
     Args:
         path: a JSON list of `{"task": …, "method": …, "seed": …, "xs": [env steps], "ys": [returns]}`, as the Dreamer
-            authors publish it; their names of tasks begin with `dmc_`.
+            authors publish it; their names of tasks begin with `dmc_`. None for those of `forbes data fetch curves`:
+            no curves where they were not fetched, or lack the task.
         task: ours, `cartpole_swingup`.
 
     Raises:
-        ForbesError: where the file cannot be read so, or does not have the task.
+        ForbesError: where the file cannot be read so, or one that was named does not have the task.
     """
+    if path is None and not curves_path().is_file():
+        return {}
     names = {task, f"dmc_{task}", f"dmc_{task.removeprefix('ball_in_')}"}  # Dreamer's name of it is cup_catch
     curves: dict[str, list[pd.Series]] = {}
     known = set()
     try:
-        with open(path) as file:
+        with open(path or curves_path()) as file:
             for one in json.load(file):
                 known.add(one["task"])
                 if one["task"] in names:
@@ -92,7 +96,7 @@ def published_curves(path: str, task: str) -> dict[str, list[pd.Series]]:
     except (ValueError, KeyError, TypeError) as error:
         expected = "a JSON list of task, method, seed, xs and ys"
         raise ForbesError(f"{path}: not a file of curves, expected {expected}. Name another, or none") from error
-    if not curves:
+    if path and not curves:
         listed = ", ".join(sorted(known)) or "nothing"
         raise ForbesError(f"{path}: has no curve of {task}, but of {listed}. Name another file, or none")
     return curves

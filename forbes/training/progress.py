@@ -11,6 +11,8 @@ from lightning.pytorch.callbacks import ProgressBar, RichProgressBar
 
 __all__ = ["PlainProgress", "TerminalProgress", "progress"]
 
+_STEPS = ("env_steps", "agent_steps")
+
 
 def progress() -> ProgressBar:
     """Choose by where the output goes."""
@@ -76,11 +78,11 @@ def _objectives(trainer: Trainer, module: LightningModule) -> dict[str, str]:
     return {
         name: _shown(name, float(value))
         for name, value in trainer.callback_metrics.items()
-        if name.endswith(f"/{objective}") or name == "env_steps" or name.startswith(("return/", "reward_explained/"))
+        if name.endswith(f"/{objective}") or name in _STEPS or name.startswith(("return/", "reward_explained/"))
     }
 
 
 def _shown(name: str, value: float) -> str:
-    if name == "env_steps":
+    if name in _STEPS:
         return f"{value:,.0f}"
     return f"{value:.{1 if abs(value) >= 100 else 3}f}"

@@ -19,7 +19,7 @@ def draw(*shape, seed=0):
     return torch.randn(2, *shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-@pytest.mark.parametrize("horizon", [2, 3, 15])
+@pytest.mark.parametrize("horizon", [2, 3, 15, 16])  # states imagined: one more than there are returns
 @pytest.mark.parametrize("lambda_", [0.0, 0.5, 0.95, 1.0])
 @pytest.mark.parametrize("ends", [False, True])
 def test_equals_the_weighted_sum_of_n_step_returns(horizon, lambda_, ends):

@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from forbes.data import commands
+from forbes.data.download import git_blob_id
 from forbes.data.stroke_file import load_strokes, save_strokes
 from forbes.data.strokes import bundled_path
 from forbes.errors import ForbesError
@@ -71,6 +72,17 @@ def test_fetch_stores_where_forbes_data_points(make_arrays, tmp_path, monkeypatc
 
     assert load_strokes(tmp_path / "store" / "dejong-strokes.npz", "")["train"].points.tolist() == [[1, 1]]
     assert f"{tmp_path / 'store' / 'dejong-strokes.npz'}: stored" in capsys.readouterr().out
+
+
+def test_fetched_curves_are_stored_there_too(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FORBES_DATA", str(tmp_path / "store"))
+    (tmp_path / "copy.json").write_text("[]")
+    monkeypatch.setattr("forbes.data.published.CURVES_BLOB", git_blob_id(tmp_path / "copy.json"))
+
+    commands.main(["fetch", "curves", "--from", str(tmp_path / "copy.json")])
+
+    assert (tmp_path / "store" / "dreamer-curves.json").read_text() == "[]"
+    assert f"{tmp_path / 'store' / 'dreamer-curves.json'}: stored" in capsys.readouterr().out
 
 
 def test_fetch_does_not_trust_a_stored_file_that_is_not_the_papers(make_arrays, tmp_path, monkeypatch):

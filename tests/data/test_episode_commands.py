@@ -61,6 +61,32 @@ def test_info_says_what_there_is_and_draws_it(pictures, tmp_path, capsys):
     assert white > 0.1
 
 
+def test_an_environment_that_hangs_ends_the_command_and_leaves_nothing_half_written(tmp_path, capsys):
+    collect = [
+        "data",
+        "collect",
+        "--task",
+        "Hanging",
+        "--timeout",
+        "1",
+        "--episodes",
+        "1",
+        "-o",
+        str(tmp_path / "store"),
+    ]
+
+    assert main(collect) == 2
+
+    dropped, again, error = capsys.readouterr().err.splitlines()
+    for line in (dropped, again):
+        assert line == "forbes: Echo: it hangs, no answer to step within 1 s; episode 0 is dropped and played again"
+    assert error == (
+        "forbes: Echo: it hangs, no answer to step within 1 s; so broke episode 0 3 times, nothing of it is stored. "
+        "Mend the environment"
+    )
+    assert not list((tmp_path / "store").glob("*.npz"))
+
+
 def test_check_finds_all_whole_and_then_the_damage(pictures, tmp_path, capsys):
     store = tmp_path / "store"
     store.mkdir()
@@ -80,6 +106,44 @@ def test_check_finds_all_whole_and_then_the_damage(pictures, tmp_path, capsys):
     assert list(EpisodeStore(store).records) == [0, 1, 3]
 
 
+@pytest.fixture
+def damaged(tmp_path, capsys):
+    """A store whose one episode is cut short."""
+    store = tmp_path / "damaged"
+    assert main(["data", "collect", "--task", "Screen", "--episodes", "1", "-o", str(store)]) == 0
+    (file,) = store.glob("*.npz")
+    file.write_bytes(file.read_bytes()[:-9])
+    capsys.readouterr()
+    return store
+
+
+def test_a_damaged_store_is_named_by_what_reads_it_and_what_is_put_aside_is_told(damaged, capsys):
+    assert re.search(r"000000\.npz: damaged .*forbes data check", error_of(capsys, "info", damaged))
+    assert main(["data", "check", str(damaged)]) == 1
+    capsys.readouterr()
+
+    for command in ("info", "check"):
+        assert error_of(capsys, command, damaged) == (
+            f"{damaged}: there are no episodes but 1 in quarantine. Collect some: forbes data collect --task TASK "
+            f"-o {damaged}"
+        )
+
+
+@pytest.mark.parametrize("what", ["empty", "damaged"])
+def test_a_training_on_no_whole_episode_is_one_sentence(what, damaged, tmp_path, capsys):
+    store = damaged if what == "damaged" else tmp_path
+    config = Path(__file__).parents[2] / "configs" / "dmc" / "world_model_rssm.yaml"
+    flags = ["--data.source.path", str(store), "--data.source.hold_out", "0", "--data.length", "6"]
+    small = ["--trainer.accelerator", "cpu", "--trainer.limit_val_batches", "0", "--run_dir", str(tmp_path / "run")]
+
+    assert main(["fit", "--config", str(config), *flags, *small]) == 2
+
+    error = capsys.readouterr().err.splitlines()[-1]
+    expected = "000000.npz: damaged" if what == "damaged" else "there are no episodes. Collect some"
+    assert error.startswith("forbes: ")
+    assert expected in error
+
+
 def test_vectors_are_described_and_not_drawn(tmp_path, capsys):
     store = tmp_path / "hike"
     assert main(["data", "collect", "--task", "mountain_hike", "--episodes", "1", "-o", str(store)]) == 0
@@ -96,6 +160,10 @@ def test_vectors_are_described_and_not_drawn(tmp_path, capsys):
     [
         (["info", "absent"], "absent: there are no episodes. Collect some: forbes data collect --task TASK -o absent"),
         (["check", "absent"], "absent: there are no episodes. Collect some: forbes data collect --task TASK -o absent"),
+        (
+            ["collect", "--task", "Unbuildable", "--episodes", "1", "-o", "x"],
+            "Unbuildable: start raises ArithmeticError: the physics has exploded",
+        ),
         (["collect", "--task", "mountain_hik", "-o", "x"], "mountain_hik: no such task. Did you mean mountain_hike?"),
         (["collect", "--task", "Picture", "-o", "x"], "Picture: no such task. Did you mean Pictures?"),
         (

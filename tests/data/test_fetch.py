@@ -9,8 +9,10 @@ import threading
 import numpy as np
 import pytest
 
-from forbes.data import fetch
-from forbes.data.fetch import convert, download, fetch_dejong, git_blob_id, read_archive, read_folder, wanted_files
+from forbes.data import fetch, published
+from forbes.data.download import download, git_blob_id
+from forbes.data.fetch import convert, fetch_dejong, read_archive, read_folder, wanted_files
+from forbes.data.published import fetch_curves
 from forbes.data.stroke_file import load_strokes, save_strokes, sha256_of_arrays
 from forbes.errors import ForbesError
 
@@ -108,7 +110,7 @@ def server(monkeypatch):
 
 
 def test_a_download_gives_the_servers_bytes(server, tmp_path):
-    download(server.url, tmp_path / "new" / "file")
+    download(server.url, tmp_path / "new" / "file", "Do this.")
 
     assert (tmp_path / "new" / "file").read_bytes() == server.content
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["file"]
@@ -117,9 +119,9 @@ def test_a_download_gives_the_servers_bytes(server, tmp_path):
 def test_an_interrupted_download_goes_on_where_it_stopped(server, tmp_path):
     server.hang_up_after = 70_000
     with pytest.raises(ForbesError, match=r"interrupted after 70000 of 200000 bytes\. Run it again to go on"):
-        download(server.url, tmp_path / "file")
+        download(server.url, tmp_path / "file", "Do this.")
     server.hang_up_after = None
-    download(server.url, tmp_path / "file")
+    download(server.url, tmp_path / "file", "Do this.")
 
     assert (tmp_path / "file").read_bytes() == server.content
     assert server.asked == [None, "bytes=70000-"]
@@ -129,7 +131,7 @@ def test_a_server_without_ranges_sends_everything_again(server, tmp_path):
     server.ranges = False
     (tmp_path / "file.part").write_bytes(b"something else")
 
-    download(server.url, tmp_path / "file")
+    download(server.url, tmp_path / "file", "Do this.")
 
     assert (tmp_path / "file").read_bytes() == server.content
 
@@ -137,21 +139,21 @@ def test_a_server_without_ranges_sends_everything_again(server, tmp_path):
 def test_a_whole_part_is_not_downloaded_again(server, tmp_path):
     (tmp_path / "file.part").write_bytes(server.content)
 
-    download(server.url, tmp_path / "file")
+    download(server.url, tmp_path / "file", "Do this.")
 
     assert (tmp_path / "file").read_bytes() == server.content
 
 
 def test_a_download_larger_than_any_file_of_the_host_is_refused(server, tmp_path, monkeypatch):
-    monkeypatch.setattr(fetch, "_DOWNLOAD_LIMIT", 100_000)
+    monkeypatch.setattr("forbes.data.download._DOWNLOAD_LIMIT", 100_000)
 
-    with pytest.raises(ForbesError, match="sends more than 100000 bytes"):
-        download(server.url, tmp_path / "file")
+    with pytest.raises(ForbesError, match=r"sends more than 100000 bytes, expected a smaller file\. Do this\."):
+        download(server.url, tmp_path / "file", "Do this.")
 
 
 def test_a_file_the_server_does_not_have_is_named(server, tmp_path):
-    with pytest.raises(ForbesError, match=r"/elsewhere: could not be downloaded \(HTTP Error 404: Not Found\)"):
-        download(server.url.replace("sequences.tar.gz", "elsewhere"), tmp_path / "file")
+    with pytest.raises(ForbesError, match=r"/elsewhere: could not be downloaded \(HTTP Error 404: Not Found\)\. Do"):
+        download(server.url.replace("sequences.tar.gz", "elsewhere"), tmp_path / "file", "Do this.")
 
 
 def test_without_a_network_one_sentence_names_the_ways_out(tmp_path, monkeypatch):
@@ -313,3 +315,38 @@ def test_wrong_labels_are_refused(folder, labels, message):
 
     with pytest.raises(ForbesError, match=message):
         convert(read_folder(folder, wanted_files(DIGITS)), DIGITS, folder)
+
+
+@pytest.fixture
+def few_curves(server, tmp_path, monkeypatch):
+    """Let the published curves be what the server has, and give a copy of them."""
+    copy = tmp_path / "copy.json"
+    copy.write_bytes(server.content)
+    monkeypatch.setattr(published, "CURVES_URL", server.url)
+    monkeypatch.setattr(published, "CURVES_BLOB", git_blob_id(copy))
+    return copy
+
+
+@pytest.mark.parametrize("local", [False, True])
+def test_curves_are_downloaded_or_copied_and_lie_there_whole(local, few_curves, tmp_path):
+    fetch_curves(few_curves if local else None, tmp_path / "store" / "curves.json")
+
+    assert (tmp_path / "store" / "curves.json").read_bytes() == few_curves.read_bytes()
+    assert [path.name for path in (tmp_path / "store").iterdir()] == ["curves.json"]
+
+
+@pytest.mark.parametrize("local", [False, True])
+def test_other_curves_are_refused_and_those_that_were_there_stay(local, few_curves, tmp_path, monkeypatch):
+    monkeypatch.setattr(published, "CURVES_BLOB", "0" * 40)
+    (tmp_path / "curves.json").write_text("before")
+
+    with pytest.raises(ForbesError, match=r"the git blob id is .*, expected 0{40}\. Give a local copy with"):
+        fetch_curves(few_curves if local else None, tmp_path / "curves.json")
+
+    assert (tmp_path / "curves.json").read_text() == "before"
+    assert not (tmp_path / "curves.json.new").exists()
+
+
+def test_a_copy_of_the_curves_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ForbesError, match=r"absent\.json: there is no such file\. Give a local copy with"):
+        fetch_curves(tmp_path / "absent.json", tmp_path / "curves.json")

@@ -1,5 +1,6 @@
 """The actor-critic: whose gradient goes where, when it is Dreamer, and that it learns to act."""
 
+import itertools
 from functools import partial
 
 import pytest
@@ -141,37 +142,40 @@ def test_a_flow_that_is_the_identity_is_dreamer(trajectories):
     torch.testing.assert_close(loss_of(forbes, make_batch()), loss_of(dreamer, make_batch()), rtol=1e-6, atol=1e-6)
 
 
-def test_the_first_sample_is_the_path_the_filter_took_and_the_others_differ():
-    model, batch = agent().model, make_batch()
+@pytest.mark.parametrize("belief", [GaussianBelief, partial(FlowBelief, layers=2, width=4)])
+def test_the_first_sample_is_the_path_the_filter_took_and_all_differ(belief):
+    model, batch = agent(belief=belief).model, make_batch()
     filtered = model.filter(model.embed(batch.observation), batch.action)
 
     one, four = belief_samples(model, filtered, 1), belief_samples(model, filtered, 4)
 
     torch.testing.assert_close(one, State(filtered.hidden[None], filtered.state[None]))
     torch.testing.assert_close(four.state[0], filtered.state)
-    assert (four.state[1:] - filtered.state).abs().amin() > 0
+    for one_of, other in itertools.combinations(four.state, 2):
+        assert (one_of - other).abs().amin() > 0
     torch.testing.assert_close(four.hidden, filtered.hidden.expand(4, -1, -1, -1))
     assert not four.state.requires_grad
 
 
 @pytest.mark.parametrize("entropy", [0.0, 0.3])
-def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy):
-    """The losses, spelled out along one trajectory."""
-    ours, batch = agent(trajectories=1, actor_entropy=entropy), make_batch(1, 1)
+@pytest.mark.parametrize("trajectories", [1, 3])
+def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy, trajectories):
+    """The losses, spelled out along each trajectory, which has a beginning and actions of its own."""
+    ours, batch = agent(trajectories=trajectories, actor_entropy=entropy), make_batch(1, 2)
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     torch.manual_seed(3)
     actor, critic = ours.control_losses(filtered, batch.mask)
 
     torch.manual_seed(3)
-    belief_samples(ours.model, filtered, 1)
-    state, states = State(filtered.hidden[:, 0], filtered.state[:, 0]), []
-    nats = []
+    state = State(*(values.flatten(0, 2) for values in belief_samples(ours.model, filtered, trajectories)))
+    nats, states = [], []
     for _ in range(4):
         action, log_prob = ours.actor(torch.cat(state, -1)).rsample()
+        assert action.unique().numel() == 2 * trajectories
         nats.append(-entropy * log_prob)
         rollout = ours.model.imagine(state, action[:, None])
         state = State(rollout.hidden[:, 0], rollout.state[:, 0])
-        states.append(torch.cat(state, -1)[0])
+        states.append(torch.cat(state, -1))
     r, v = [ours.reward(f) for f in states], [ours.critic(f) for f in states]
     g, l = 0.99, 0.95  # noqa: E741
     third = r[2] + g * v[3]
@@ -179,9 +183,9 @@ def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy):
     first = r[0] + g * ((1 - l) * v[1] + l * second)
 
     acting = (first + nats[0]) + g * (second + nats[1]) + g**2 * (third + nats[2])
-    torch.testing.assert_close(actor, -acting.squeeze() / 3)
+    torch.testing.assert_close(actor, -acting.mean() / 3)
     errors = [(value - target) ** 2 / 2 for value, target in zip(v, (first, second, third), strict=False)]
-    torch.testing.assert_close(critic, (errors[0] + g * errors[1] + g**2 * errors[2]) / 3)
+    torch.testing.assert_close(critic, (errors[0] + g * errors[1] + g**2 * errors[2]).mean() / 3)
 
 
 @pytest.mark.parametrize("side", [-1, 1])

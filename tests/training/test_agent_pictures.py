@@ -218,6 +218,18 @@ def test_published_curves_are_drawn_as_mean_and_range_over_their_seeds(tmp_path)
     assert figure.axes[0].get_xlim()[1] == pytest.approx(1.02 * 15)
 
 
+def test_fetched_curves_are_drawn_without_being_asked_for_where_they_have_the_task(tmp_path, monkeypatch):
+    monkeypatch.setenv("FORBES_DATA", str(tmp_path))
+    assert published_curves(None, "walker_walk") == {}  # not fetched
+
+    named = [{"task": "dmc_walker_walk", "method": "dreamer", "seed": 0, "xs": [0, 10], "ys": [1, 2]}]
+    (tmp_path / "dreamer-curves.json").write_text(json.dumps(named))
+
+    (curve,) = published_curves(None, "walker_walk")["dreamer"]
+    assert dict(curve) == {0: 1, 10: 2}
+    assert published_curves(None, "mountain_hike") == {}
+
+
 def test_a_curve_without_any_return_yet_is_empty():
     figure = return_curve(pd.DataFrame({"env_steps": [36.0]}), "task", {})
 

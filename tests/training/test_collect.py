@@ -132,11 +132,13 @@ def test_says_where_episodes_end_and_the_agent_imagines_that_none_does(tmp_path)
     assert (read_metrics(tmp_path / "run")["train/continuation"] < 0).sum() == 12  # a log-probability at each update
 
 
-def test_the_progress_counts_env_steps_beside_updates(tmp_path, capsys):
+def test_the_progress_counts_both_kinds_of_steps_beside_updates(tmp_path, capsys):
     assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run") == 0
 
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("epoch ")]
     assert [line.split("env_steps ")[1].split()[0] for line in lines] == ["48", "72", "96"]
+    assert [line.split("agent_steps ")[1].split()[0] for line in lines] == ["16", "24", "32"]
+    assert [line.split("update ")[1].split()[0] for line in lines] == ["4/12", "8/12", "12/12"]
 
 
 def test_a_start_that_left_no_checkpoint_lends_another_only_the_episodes_it_would_play(run, tmp_path, monkeypatch):
@@ -173,7 +175,7 @@ def test_an_environment_of_other_shapes_than_the_checkpoints_is_refused(run, tmp
     assert len(EpisodeStore(tmp_path / "run" / "episodes").records) == 4
 
 
-@pytest.mark.parametrize("trouble", ["raises", "rewards_nan"])
+@pytest.mark.parametrize("trouble", ["raises", "rewards_nan", "sees_nan", "dies"])
 def test_an_environment_that_fails_for_good_ends_the_training_and_loses_nothing(tmp_path, capsys, trouble):
     """In the fourth episode it learns from, after two that measured it; then it is well, and the run goes on."""
     options = f"{{trouble: {trouble}, ledger: {tmp_path / 'ledger'}, healthy: 5}}"

@@ -4,12 +4,13 @@ from functools import partial
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
-from forbes.models import MLPDecoder, MLPEncoder, VectorNormal
-from forbes.training import ImaginationActorCritic
+from forbes.models import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder, Normal, VectorNormal
+from forbes.training import ImaginationActorCritic, PlanningAgent
+from forbes.training.acting import ActingModel
 
 BATCH, TIME = 3, 2
 
@@ -18,7 +19,7 @@ BATCH, TIME = 3, 2
 def quiet(monkeypatch):
     """Without a trainer there is nowhere to log to."""
     for name in ("log", "log_dict"):
-        monkeypatch.setattr(ImaginationActorCritic, name, lambda *args, **kwargs: None)
+        monkeypatch.setattr(ActingModel, name, lambda *args, **kwargs: None)
 
 
 @pytest.fixture(autouse=True)
@@ -28,76 +29,88 @@ def fresh_compiler():
     torch.compiler.reset()
 
 
-@pytest.fixture(
-    params=[
-        {"belief": GaussianBelief},
-        {"belief": partial(FlowBelief, layers=2, width=4)},
-        {"belief": GaussianBelief, "discrete": True, "continuation": True, "actor_entropy": 0.1},
-    ],
-    ids=["dreamer", "forbes", "discrete"],
-    name="agent",
-)
-def agent_fixture(request):
+VECTORS = {
+    "encoder": partial(MLPEncoder, width=8, layers=1),
+    "decoder": partial(MLPDecoder, width=8, layers=1),
+    "likelihood": VectorNormal(),
+    "observation_shape": (3,),
+}
+IMAGES = {
+    "encoder": partial(ConvEncoder, channels=1),
+    "decoder": partial(ConvDecoder, channels=1),
+    "likelihood": Normal(bits=5),
+    "observation_shape": (3, 28, 28),
+}
+ACTOR_CRITIC = partial(ImaginationActorCritic, trajectories=2, horizon=2)
+FLOW = partial(FlowBelief, layers=2, width=4)
+AGENTS = {
+    "dreamer": partial(ACTOR_CRITIC, belief=GaussianBelief, **VECTORS),
+    "forbes": partial(ACTOR_CRITIC, belief=FLOW, **VECTORS),
+    "forbes, images": partial(ACTOR_CRITIC, belief=FLOW, **IMAGES),
+    "discrete": partial(
+        ACTOR_CRITIC, belief=GaussianBelief, discrete=True, continuation=True, actor_entropy=0.1, **VECTORS
+    ),
+    "planet, images": partial(PlanningAgent, belief=GaussianBelief, **IMAGES),
+}
+
+
+def make_agent(kind):
     torch.manual_seed(0)
-    return ImaginationActorCritic(
-        trajectories=2,
-        horizon=2,
-        control_dim=8,
-        encoder=partial(MLPEncoder, width=8, layers=1),
-        decoder=partial(MLPDecoder, width=8, layers=1),
-        likelihood=VectorNormal(),
-        observation_shape=(3,),
-        action_dim=2,
-        state_dim=2,
-        hidden_dim=6,
-        mlp_dim=8,
-        mlp_layers=1,
-        **request.param,
-    )
+    sizes = {"action_dim": 2, "state_dim": 2, "hidden_dim": 6, "mlp_dim": 8, "mlp_layers": 1, "control_dim": 8}
+    return AGENTS[kind](**sizes)
 
 
-def make_batch():
+def make_batch(kind):
+    shape = AGENTS[kind].keywords["observation_shape"]
     generator = torch.Generator().manual_seed(0)
-    observation, action = torch.rand(2, BATCH, TIME, 3, generator=generator)
-    mask = torch.ones(BATCH, TIME, dtype=torch.bool)
-    return SequenceBatch(observation, action[..., :2], observation[..., 0], mask, torch.zeros(BATCH, TIME, 0), ~mask)
+    observation = torch.rand(BATCH, TIME, *shape, generator=generator)
+    if len(shape) == 3:
+        observation = (255 * observation).to(torch.uint8)
+    action, mask = torch.rand(BATCH, TIME, 2, generator=generator), torch.ones(BATCH, TIME, dtype=torch.bool)
+    return SequenceBatch(observation, action, action[..., 0], mask, torch.zeros(BATCH, TIME, 0), ~mask)
 
 
-class Waits(TorchDispatchMode):
-    """Counts how often the program asks for the value of a tensor: on a GPU it would wait for all work so far."""
-
-    number = 0
-
-    def __torch_dispatch__(self, operation, types, arguments=(), options=None):
-        self.number += operation is torch.ops.aten._local_scalar_dense.default
-        return operation(*arguments, **(options or {}))
-
-
-def test_the_losses_of_an_update_are_one_graph_with_the_same_gradients(agent):
+@pytest.mark.parametrize("kind", AGENTS)
+def test_the_losses_of_an_update_are_one_graph_with_the_same_gradients(kind):
+    """A break of the graph is an error, by `fullgraph`."""
+    agent, results = make_agent(kind), []
     compiled = torch.compile(lambda batch: agent.training_step(batch, 0), fullgraph=True, backend="eager")
-    results = []
 
     for loss_of in (lambda batch: agent.training_step(batch, 0), compiled):
         torch.manual_seed(1)
-        loss = loss_of(make_batch())
-        results.append((loss, *torch.autograd.grad(loss, list(agent.parameters()))))
+        loss = loss_of(make_batch(kind))
+        results.append((loss, *torch.autograd.grad(loss, [p for group in agent.groups() for p in group.parameters])))
 
     torch.testing.assert_close(results[0], results[1])
 
 
-def test_no_operation_of_an_update_waits_for_a_value(agent):
-    optimizer = agent.configure_optimizers()["optimizer"]
+@pytest.mark.parametrize("kind", AGENTS)
+def test_an_update_never_asks_for_the_value_of_a_tensor(kind):
+    """From the batch to the step of Adam it runs on tensors that have none; on a GPU nothing in it can wait for one."""
+    with FakeTensorMode():
+        agent = make_agent(kind)
+        optimizer = agent.configure_optimizers()["optimizer"]
 
-    with Waits() as waits:
-        agent.training_step(make_batch(), 0).backward()
+        agent.training_step(make_batch(kind), 0).backward()
         agent.configure_gradient_clipping(optimizer)
         optimizer.step()
 
-    assert waits.number == 0
+        assert all(p.grad.shape == p.shape for group in agent.groups() for p in group.parameters)
 
 
-def test_a_wait_is_noticed():
-    with Waits() as waits:
-        torch.ones(()).item()
-
-    assert waits.number == 1
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda x: x.sum().item(),
+        lambda x: bool(x.any()),
+        lambda x: x.tolist(),
+        lambda x: x.numpy(),
+        lambda x: x[x > 0],
+        lambda x: x.nonzero(),
+        lambda x: x.masked_select(x > 0),
+        lambda x: x.unique(),
+    ],
+)
+def test_who_asks_for_a_value_or_a_shape_that_depends_on_one_is_caught(ask):
+    with FakeTensorMode(), pytest.raises(RuntimeError):
+        ask(torch.rand(3))

@@ -20,7 +20,8 @@ class ReturnCurve(PictureCallback):
     It reads `metrics.jsonl`, so a resumed run shows its whole life.
 
     Args:
-        reference: a file of published curves of the same task, to draw beside it; see `published_curves`.
+        reference: a file of published curves of the same task, to draw beside it; see `published_curves`. By default
+            those of `forbes data fetch curves`, where they are there and have the task.
         every: draw after every k-th epoch.
 
     Raises:
@@ -47,4 +48,4 @@ class ReturnCurve(PictureCallback):
         """Give the task, and what others have published of it."""
         source = data.source
         assert isinstance(source, Experience)
-        return source.task, published_curves(self.reference, source.task) if self.reference else {}
+        return source.task, published_curves(self.reference, source.task)

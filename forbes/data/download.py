@@ -1,0 +1,77 @@
+"""Data that do not come with the package: where they are kept, how they are downloaded and recognised."""
+
+import hashlib
+import http
+import http.client
+import os
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+from forbes.errors import ForbesError
+
+__all__ = ["data_folder", "download", "git_blob_id"]
+
+_DOWNLOAD_LIMIT = 100 * 2**20  # bytes; GitHub stores no larger file
+_CHUNK = 2**16
+
+
+def data_folder() -> Path:
+    """Where they are kept: `$FORBES_DATA`, else the user's cache."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "forbes"
+    return Path(os.environ.get("FORBES_DATA") or cache)
+
+
+def download(url: str, path: Path, remedy: str) -> None:
+    """Download a file, from where an earlier attempt was interrupted.
+
+    Args:
+        url: of the file.
+        path: where it comes to lie once it is whole; until then `PATH.part` grows beside it.
+        remedy: what to do where it cannot be had, for errors.
+
+    Raises:
+        ForbesError: where it cannot be had, is interrupted, or is larger than any file of GitHub.
+    """
+    part = path.with_name(f"{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        held = part.stat().st_size if part.exists() else 0
+        request = urllib.request.Request(url, headers={"Range": f"bytes={held}-"} if held else {})
+        with urllib.request.urlopen(request, timeout=30) as response:
+            _receive(response, part, url, remedy)
+    except urllib.error.HTTPError as error:
+        error.close()
+        if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:  # that is: there is nothing left to send
+            raise ForbesError(f"{url}: could not be downloaded ({error}). {remedy}") from error
+    except (OSError, http.client.HTTPException) as error:
+        raise ForbesError(f"{url}: could not be downloaded ({getattr(error, 'reason', error)}). {remedy}") from error
+    part.replace(path)
+
+
+def _receive(response: http.client.HTTPResponse, part: Path, url: str, remedy: str) -> None:
+    """Write a response's body, behind what is there already if the server agreed to go on from there."""
+    resumed = response.status == http.HTTPStatus.PARTIAL_CONTENT
+    announced = response.headers["Content-Length"]
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with part.open("ab" if resumed else "wb") as file, Progress(*columns) as progress:
+        total = file.tell() + int(announced) if announced else None
+        task = progress.add_task(url.rpartition("/")[2], total=total, completed=file.tell())
+        while chunk := response.read(_CHUNK):
+            file.write(chunk)
+            progress.update(task, completed=file.tell())
+            if file.tell() > _DOWNLOAD_LIMIT:
+                raise ForbesError(f"{url}: sends more than {_DOWNLOAD_LIMIT} bytes, expected a smaller file. {remedy}")
+        if total is not None and file.tell() < total:
+            raise ForbesError(f"{url}: interrupted after {file.tell()} of {total} bytes. Run it again to go on.")
+
+
+def git_blob_id(path: Path) -> str:
+    """Name a file's content as git does: the SHA-1 of ``blob <size>``, a zero byte and the bytes."""
+    digest = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
