@@ -1,5 +1,6 @@
 """The command line: what it lists, what it leaves behind, and each bad input as one sentence and exit code 2."""
 
+import importlib.metadata
 import json
 import math
 import resource
@@ -186,6 +187,7 @@ def test_a_run_folder_is_named_after_its_configuration_and_holds_all_of_the_run(
     assert start["exit_status"] == 0
     assert start["command"].startswith("forbes fit --config ")
     assert start["versions"]["forbes"] == __version__
+    assert start["versions"]["mujoco"] == importlib.metadata.version("mujoco")
     assert read_metrics(run).index.max() == 10
     assert (run / "checkpoints" / "last.ckpt").is_file()
 

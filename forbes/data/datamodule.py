@@ -140,6 +140,6 @@ class SequenceDataModule(LightningDataModule):
 
     def _loader(self, split: Split, indices: Any) -> DataLoader[Any]:
         # A batch is gathered in less time than a worker process needs to hand it over.
-        # From pinned memory a GPU fetches it while it still computes, and nothing waits.
+        # From pinned memory a GPU fetches it while it still computes.
         batches = _Batches(self.source, split, self.length, indices)
         return DataLoader(batches, batch_size=None, pin_memory=torch.cuda.is_available())

@@ -65,7 +65,7 @@ class EnvironmentProcess(Environment):
     """
 
     def __init__(self, make: Callable[[], Environment], timeout: float = 60.0) -> None:
-        self._make, self._timeout = make, timeout
+        self.make, self._timeout = make, timeout
         self._process: multiprocessing.process.BaseProcess | None = None
         self._start()
 
@@ -104,12 +104,12 @@ class EnvironmentProcess(Environment):
     def _name(self) -> str:
         """What errors call it: its task or, until it is built, what builds it."""
         built = hasattr(self, "_description")
-        return str(self._description["task"] if built else getattr(self._make, "func", self._make).__name__)
+        return str(self._description["task"] if built else getattr(self.make, "func", self.make).__name__)
 
     def _start(self) -> None:
         spawn = multiprocessing.get_context("spawn")
         self._connection, theirs = spawn.Pipe()
-        self._process = spawn.Process(target=_serve, args=(theirs, self._make), daemon=True)
+        self._process = spawn.Process(target=_serve, args=(theirs, self.make), daemon=True)
         self._process.start()
         atexit.register(self.close)  # multiprocessing would ask it to end, which it leaves to its parent, and wait
         theirs.close()  # so that the end of the process is the end of the pipe

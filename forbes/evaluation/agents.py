@@ -16,11 +16,14 @@ from forbes.arguments import ArgumentParser, positive
 from forbes.data import Experience
 from forbes.data.collection import describe_environment
 from forbes.data.episodes import Episode
-from forbes.envs import Environment
+from forbes.envs import Environment, EnvironmentProcess
+from forbes.envs.known_process import KnownProcess
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.foresight import SAMPLES, STEPS_AHEAD, explained, foretell
 from forbes.evaluation.record import write_record
+from forbes.evaluation.reward_uncertainty import DRAWS, exact_variance, learned_variance, uncertainty
+from forbes.pomdps import Process
 from forbes.seeding import derive_seed
 from forbes.training.acting import ActingModel, play_measured
 from forbes.training.loading import load_run, loaded_agent
@@ -42,6 +45,8 @@ class _Played(NamedTuple):
     """Undiscounted, `(E,)`, float64."""
     explained: list[Estimate | None]
     """The share of the rewards' variance that the world model foretold, for each of `STEPS_AHEAD`."""
+    uncertainty: Estimate | None
+    """See `forbes.evaluation.reward_uncertainty`; None where the exact belief is not known."""
     environment: dict[str, Any]
 
 
@@ -84,16 +89,28 @@ def evaluate_agents(
     _print(played)
 
 
-def _play(run: str, agent: ActingModel, environment: Environment, episodes: int, seed: int) -> _Played:
+def _play(run: str, agent: ActingModel, environment: EnvironmentProcess, episodes: int, seed: int) -> _Played:
     returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
+    process, variances = _known_process(environment), list[tuple[Tensor, Tensor]]()
     for number in _counted(run, episodes):
         episode = play_test_episode(agent, environment, seed, number)
         returns.append(episode.total_reward)
         rewards.append(torch.from_numpy(episode.reward[1:]).double())  # (T,)
         draws = derive_seed(seed, "foresight", number)
         foretold.append(foretell(agent, episode, draws, f"{run}, test episode {number}"))
+        if process is not None:
+            variances.append((learned_variance(agent, episode, draws), exact_variance(process, episode, draws)))
     total = torch.tensor(returns, dtype=torch.float64)  # (E,)
-    return _Played(run, agent, total, explained(foretold, rewards), describe_environment(environment))
+    share = uncertainty(*zip(*variances, strict=True)) if variances else None
+    return _Played(run, agent, total, explained(foretold, rewards), share, describe_environment(environment))
+
+
+def _known_process(environment: EnvironmentProcess) -> Process | None:
+    """Give the process behind an environment that shows its observations, if its belief is known exactly."""
+    if environment.describe().get("shows") != "observation":
+        return None
+    known = environment.make()
+    return known.process if isinstance(known, KnownProcess) else None
 
 
 def _record(one: _Played, seed: int, command: str) -> None:
@@ -117,6 +134,8 @@ def _record(one: _Played, seed: int, command: str) -> None:
         for distance, share in zip(STEPS_AHEAD, one.explained, strict=True)
         if share is not None
     }
+    if one.uncertainty is not None:
+        shares[f"reward_uncertainty[S={DRAWS},{tag}]"] = one.uncertainty._asdict() | measured
     name = f"return[{tag}]"
     write_record(one.run, {name: entry | measured} | shares, {name: one.returns})
 
@@ -166,6 +185,8 @@ def _print(played: Sequence[_Played]) -> None:
         table.add_row(escape(one.run), kind, f"{size:,}", samples, str(Estimate.of(one.returns)), *ends)
     console.print(table)
     console.print(_foresight(played))
+    if any(one.uncertainty is not None for one in played):
+        console.print(_uncertainty(played))
     for first, second in itertools.combinations(played, 2):
         difference = Estimate.of(first.returns - second.returns)
         console.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
@@ -178,4 +199,13 @@ def _foresight(played: Sequence[_Played]) -> Table:
         table.add_column(f"{distance} steps ahead" if distance else "when seen", justify="right")
     for one in played:
         table.add_row(escape(one.run), *("n/a" if share is None else str(share) for share in one.explained))
+    return table
+
+
+def _uncertainty(played: Sequence[_Played]) -> Table:
+    title = "variance of the reward that comes with an observation, over draws of the belief"
+    table = Table("run", title=f"{title}, as a share of the exact belief's")
+    table.add_column("share", justify="right")
+    for one in played:
+        table.add_row(escape(one.run), "n/a" if one.uncertainty is None else str(one.uncertainty))
     return table

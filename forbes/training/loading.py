@@ -11,7 +11,7 @@ from lightning import LightningModule
 from torch import Tensor, nn
 
 from forbes.data import Experience, SequenceDataModule
-from forbes.envs import Environment
+from forbes.envs import EnvironmentProcess
 from forbes.errors import ForbesError
 from forbes.training.acting import ActingModel
 from forbes.training.checkpoint import read_checkpoint
@@ -68,7 +68,7 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
 
 
 @contextmanager
-def loaded_agent(run: str, device: str, samples: int | None = None) -> Iterator[tuple[ActingModel, Environment]]:
+def loaded_agent(run: str, device: str, samples: int | None = None) -> Iterator[tuple[ActingModel, EnvironmentProcess]]:
     """Load a run's agent on a device, with its environment, which is closed at the end.
 
     Args:

@@ -7,8 +7,9 @@ import shlex
 import subprocess
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from forbes.training.stop import StopOnSignal
 
 __all__ = ["RecordRun", "commit"]
 
-PACKAGES = ("torch", "lightning", "jsonargparse", "numpy")
+PACKAGES = ("torch", "lightning", "jsonargparse", "numpy", "dm-control", "mujoco", "gymnasium")
+"""What may change the numbers of a run; the last three are optional."""
 
 
 class RecordRun(SaveConfigCallback):
@@ -89,8 +91,7 @@ def _describe(arguments: Sequence[str]) -> dict[str, Any]:
         "command": shlex.join(["forbes", *arguments]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": commit(),
-        "versions": {"forbes": forbes.__version__, "python": platform.python_version()}
-        | {name: version(name) for name in PACKAGES},
+        "versions": _versions(),
         "machine": {
             "name": platform.node(),
             "system": platform.platform(),
@@ -99,6 +100,14 @@ def _describe(arguments: Sequence[str]) -> dict[str, Any]:
             "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         },
     }
+
+
+def _versions() -> dict[str, str]:
+    versions = {"forbes": forbes.__version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions
 
 
 def _describe_data(trainer: Trainer) -> dict[str, Any]:
