@@ -29,13 +29,18 @@ class Experience(SequenceSource):
         task: as for `forbes data collect`: `cartpole_swingup`, `mountain_hike`, `gymnasium:ID`, a class of your own.
         options: of its environment, e.g. `{pixels: false, action_repeat: 4}`.
         capacity: agent steps of the latest episodes that are kept; None keeps all.
+        timeout: seconds in which the environment must answer; one that does not is started anew.
 
     Raises:
-        ForbesError: for an unknown task or option.
+        ForbesError: for an unknown task or option, or a timeout that is not above 0.
     """
 
-    def __init__(self, task: str, options: dict[str, Any] | None = None, capacity: int | None = None) -> None:
-        self.task, self.options, self.capacity = task, options or {}, capacity
+    def __init__(
+        self, task: str, options: dict[str, Any] | None = None, capacity: int | None = None, timeout: float = 60.0
+    ) -> None:
+        if not timeout > 0:
+            raise ForbesError(f"Experience: timeout is {timeout}, expected seconds above 0. Choose another")
+        self.task, self.options, self.capacity, self.timeout = task, options or {}, capacity, timeout
         self._make = find_environment(task, **self.options)
         self._writer: EpisodeWriter | None = None
         self._replay: Replay | None = None
@@ -43,12 +48,12 @@ class Experience(SequenceSource):
     @cached_property
     def environment(self) -> EnvironmentProcess:
         """The environment, in a process that starts when it is first asked for."""
-        return EnvironmentProcess(self._make)
+        return EnvironmentProcess(self._make, self.timeout)
 
     @cached_property
     def player(self) -> Player:
         """What plays while this process trains; it starts when it is first asked for."""
-        return Player(self._make)
+        return Player(self._make, self.timeout)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:  # type: ignore[override]

@@ -24,12 +24,13 @@ class Player:
 
     Args:
         make: makes the environment.
+        timeout: see `EnvironmentProcess`.
     """
 
-    def __init__(self, make: Callable[[], Environment]) -> None:
+    def __init__(self, make: Callable[[], Environment], timeout: float = 60.0) -> None:
         spawn = multiprocessing.get_context("spawn")
         self._connection, theirs = spawn.Pipe()
-        self._process = spawn.Process(target=_serve, args=(theirs, make))
+        self._process = spawn.Process(target=_serve, args=(theirs, make, timeout))
         self._process.start()
         theirs.close()  # so that the end of the process is the end of the pipe
 
@@ -71,12 +72,12 @@ class Player:
         self._connection.close()
 
 
-def _serve(connection: Connection, make: Callable[[], Environment]) -> None:
+def _serve(connection: Connection, make: Callable[[], Environment], timeout: float) -> None:
     """Run in the process: play what is asked for until the parent is gone."""
     belong_to_parent()
     torch.set_num_threads(1)
     try:
-        with EnvironmentProcess(make) as environment:
+        with EnvironmentProcess(make, timeout) as environment:
             while True:
                 make_policy, number, seed = connection.recv()
                 connection.send(play_whole(environment, make_policy, seed, number))

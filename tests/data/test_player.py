@@ -62,10 +62,12 @@ def test_a_broken_episode_is_played_again(tmp_path):
         assert len(player.finish().action) == 7
 
 
-def test_an_environment_that_breaks_each_time_is_named(tmp_path):
-    with closing(Player(partial(Troubled, "raises", tmp_path / "ledger", times=9))) as player:
+@pytest.mark.parametrize("trouble", ["raises", "hangs"])
+def test_an_environment_that_breaks_each_time_is_named(trouble, tmp_path):
+    timeout = 1.0 if trouble == "hangs" else 60.0
+    with closing(Player(partial(Troubled, trouble, tmp_path / "ledger", times=9), timeout)) as player:
         player.begin(Said(0.5), number=4, seed=0)
-        with pytest.raises(ForbesError, match="so broke episode 4 3 times, nothing of it is stored"):
+        with pytest.raises(ForbesError, match=f"{trouble}.* so broke episode 4 3 times, nothing of it is stored"):
             player.finish()
 
 

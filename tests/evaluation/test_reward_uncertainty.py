@@ -110,9 +110,7 @@ def test_who_has_the_exact_belief_is_as_unsure_as_it_and_who_has_its_mean_is_sur
         for draws in (True, False)
     ]
 
-    assert shares[0] == pytest.approx(
-        1, abs=5 * 2 * math.sqrt(2 / DRAWS)
-    )
+    assert shares[0] == pytest.approx(1, abs=5 * 2 * math.sqrt(2 / DRAWS))
     assert shares[1] == 0
 
 

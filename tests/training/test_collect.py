@@ -190,6 +190,17 @@ def test_an_environment_that_fails_for_good_ends_the_training_and_loses_nothing(
     assert list(EpisodeStore(tmp_path / "run" / "episodes").records) == [0, 1, 2, 3]
 
 
+def test_an_environment_that_hangs_ends_the_training_after_its_time(tmp_path, capsys):
+    hangs = ("--data.source.task", "Hanging", "--data.source.options", "{}", "--data.source.timeout", 1)
+
+    assert fit("--config", write_config(tmp_path), *hangs, "--run_dir", tmp_path / "run") == 2
+
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "it hangs, no answer to step within 1 s; so broke episode 0 3 times" in error
+    assert fit("--config", write_config(tmp_path), "--data.source.timeout", 0) == 2
+    assert "Experience: timeout is 0" in capsys.readouterr().err
+
+
 def test_a_disk_that_is_full_ends_the_training_and_loses_nothing(run, tmp_path, monkeypatch, capsys):
     def full(path, content):
         if path.name == "000003.npz":
