@@ -21,8 +21,9 @@ from forbes.envs.known_process import KnownProcess
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.foresight import SAMPLES, STEPS_AHEAD, explained, foretell
+from forbes.evaluation.gaussianity import prior_and_posterior
 from forbes.evaluation.record import write_record
-from forbes.evaluation.reward_uncertainty import DRAWS, exact_variance, learned_variance, uncertainty
+from forbes.evaluation.reward_uncertainty import exact_variance, learned_variance, uncertainty
 from forbes.pomdps import Process
 from forbes.seeding import derive_seed
 from forbes.training.acting import ActingModel, play_measured
@@ -32,6 +33,8 @@ from forbes.training.run_folder import RunFolder
 
 __all__ = ["add_acting_samples", "evaluate_agents", "is_agent", "play_test_episode"]
 
+_DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
+_REWARD = "reward_uncertainty"
 _APART = ("made_by", "shows", "observation_shape")
 """In what environments of one task may differ: an agent that is shown the exact belief earns the same rewards."""
 
@@ -45,8 +48,9 @@ class _Played(NamedTuple):
     """Undiscounted, `(E,)`, float64."""
     explained: list[Estimate | None]
     """The share of the rewards' variance that the world model foretold, for each of `STEPS_AHEAD`."""
-    uncertainty: Estimate | None
-    """See `forbes.evaluation.reward_uncertainty`; None where the exact belief is not known."""
+    belief: dict[str, Estimate]
+    """What is said of the belief, by metric: `_DISTANCES` from a Gaussian, where s is
+    continuous, and `_REWARD`, where the exact belief is known."""
     environment: dict[str, Any]
 
 
@@ -91,18 +95,24 @@ def evaluate_agents(
 
 def _play(run: str, agent: ActingModel, environment: EnvironmentProcess, episodes: int, seed: int) -> _Played:
     returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
-    process, variances = _known_process(environment), list[tuple[Tensor, Tensor]]()
+    process, variances, distances = _known_process(environment), list[tuple[Tensor, Tensor]](), list[Tensor]()
     for number in _counted(run, episodes):
         episode = play_test_episode(agent, environment, seed, number)
         returns.append(episode.total_reward)
         rewards.append(torch.from_numpy(episode.reward[1:]).double())  # (T,)
         draws = derive_seed(seed, "foresight", number)
         foretold.append(foretell(agent, episode, draws, f"{run}, test episode {number}"))
+        if (distance := prior_and_posterior(agent, episode, draws)) is not None:
+            distances.append(distance)
         if process is not None:
             variances.append((learned_variance(agent, episode, draws), exact_variance(process, episode, draws)))
     total = torch.tensor(returns, dtype=torch.float64)  # (E,)
-    share = uncertainty(*zip(*variances, strict=True)) if variances else None
-    return _Played(run, agent, total, explained(foretold, rewards), share, describe_environment(environment))
+    belief = dict[str, Estimate]()
+    if distances:
+        belief |= zip(_DISTANCES, map(Estimate.of, torch.stack(distances, 1)), strict=True)  # 2 x (E,)
+    if variances:
+        belief[_REWARD] = uncertainty(*zip(*variances, strict=True))
+    return _Played(run, agent, total, explained(foretold, rewards), belief, describe_environment(environment))
 
 
 def _known_process(environment: EnvironmentProcess) -> Process | None:
@@ -134,8 +144,7 @@ def _record(one: _Played, seed: int, command: str) -> None:
         for distance, share in zip(STEPS_AHEAD, one.explained, strict=True)
         if share is not None
     }
-    if one.uncertainty is not None:
-        shares[f"reward_uncertainty[S={DRAWS},{tag}]"] = one.uncertainty._asdict() | measured
+    shares |= {f"{metric}[{tag}]": estimate._asdict() | measured for metric, estimate in one.belief.items()}
     name = f"return[{tag}]"
     write_record(one.run, {name: entry | measured} | shares, {name: one.returns})
 
@@ -185,8 +194,8 @@ def _print(played: Sequence[_Played]) -> None:
         table.add_row(escape(one.run), kind, f"{size:,}", samples, str(Estimate.of(one.returns)), *ends)
     console.print(table)
     console.print(_foresight(played))
-    if any(one.uncertainty is not None for one in played):
-        console.print(_uncertainty(played))
+    if any(one.belief for one in played):
+        console.print(_beliefs(played))
     for first, second in itertools.combinations(played, 2):
         difference = Estimate.of(first.returns - second.returns)
         console.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
@@ -202,10 +211,12 @@ def _foresight(played: Sequence[_Played]) -> Table:
     return table
 
 
-def _uncertainty(played: Sequence[_Played]) -> Table:
-    title = "variance of the reward that comes with an observation, over draws of the belief"
-    table = Table("run", title=f"{title}, as a share of the exact belief's")
-    table.add_column("share", justify="right")
+def _beliefs(played: Sequence[_Played]) -> Table:
+    table = Table("run", title="the belief: its KL from the nearest Gaussian; how unsure it is of a reward it has met")
+    for column in ("prior, nats a step", "posterior, nats a step", "variance of the reward / exact belief's"):
+        table.add_column(column, justify="right")
     for one in played:
-        table.add_row(escape(one.run), "n/a" if one.uncertainty is None else str(one.uncertainty))
+        *distances, reward = (one.belief.get(metric) for metric in (*_DISTANCES, _REWARD))
+        nats = ("n/a" if each is None else f"{each.mean:z.3f} ± {each.standard_error:.3f}" for each in distances)
+        table.add_row(escape(one.run), *nats, "n/a" if reward is None else str(reward))
     return table
