@@ -63,9 +63,10 @@ stopped.
 Agents play --episodes without exploration, the same ones for all, whatever each is shown; their score is the return.
 Beside it stands what share of the rewards' variance in these episodes the world model foretells, from its belief and 1,
 5 and 15 steps ahead by the actions taken: 1 is perfect, 0 no better than the mean reward, as of a model that knows its
-own episodes by heart, or where rewards hardly vary. Of a process whose exact belief is known, so does how unsure the
-agent's belief is of the reward, as a share of the exact one's variance: near 0 where its draws all say the same. All
-is kept as each agent ends; interrupted, all play again.
+own episodes by heart, or where rewards hardly vary; then how far prior and posterior are from the nearest Gaussian, 0
+where the family makes no difference; and, of a process whose exact belief is known, how unsure the agent's belief is of
+the reward, as a share of the exact one's variance: near 0 where its draws all say the same. All is kept as each agent
+ends; interrupted, all play again.
 
 With --acting-samples 32 an agent takes the mean action of 32 trajectories of its belief (of discrete actions the
 commonest), not that of one, which is the paper's: no training is needed for it, and where an observation tells little
