@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,8 @@ class DeepMindControl(Environment):
         backend: str | None = None,
     ) -> None:
         require_repeat(task, action_repeat)
+        if find_spec("dm_control") is None:  # before what renders is looked for, which would say so of every backend
+            raise ForbesError(f"{task}: dm_control is not installed. pip install 'forbes[dmc]'")
         self.task, self.pixels, self.action_repeat, self.size, self.fast = task, pixels, action_repeat, size, fast
         self.backend = (backend or choose_backend().backend) if pixels else _NO_RENDERING
         self._environment = _load(task, self.backend)
@@ -128,13 +131,10 @@ def _load(task: str, backend: str) -> Any:
     """Import the suite for a backend and load a task.
 
     Raises:
-        ForbesError: where it is not installed, was imported for another backend, or has no such task.
+        ForbesError: where it was imported for another backend, or has no such task.
     """
-    try:
-        with _environment_variable("MUJOCO_GL", backend):  # it is read at the first import
-            from dm_control import _render, suite
-    except ModuleNotFoundError as error:
-        raise ForbesError(f"{task}: {error.name} is not installed. pip install 'forbes[dmc]'") from error
+    with _environment_variable("MUJOCO_GL", backend):  # it is read at the first import
+        from dm_control import _render, suite
     if backend not in (_NO_RENDERING, _render.BACKEND):
         raise ForbesError(
             f"{task}: this process has imported dm_control with MUJOCO_GL={_render.BACKEND}, expected {backend}. "

@@ -8,7 +8,7 @@ from toy_environments import Measured
 
 suite = pytest.importorskip("dm_control.suite")
 
-from forbes.envs import DeepMindControl, EnvironmentProcess, find_environment  # noqa: E402
+from forbes.envs import DeepMindControl, EnvironmentProcess, control, find_environment  # noqa: E402
 from forbes.errors import ForbesError  # noqa: E402
 
 
@@ -161,6 +161,15 @@ def test_the_buffer_is_as_large_as_the_frame(backend):
     make = partial(Measured, "cartpole_balance", backend=backend, size=48)
     with EnvironmentProcess(make) as environment:
         assert environment.describe()["buffer"] == [48, 48]
+
+
+@pytest.mark.parametrize("pixels", [True, False])
+def test_without_the_suite_one_sentence_says_how_to_get_it(pixels, monkeypatch):
+    """And not that no backend renders, which is true too."""
+    monkeypatch.setattr(control, "find_spec", lambda name: None)
+
+    with pytest.raises(ForbesError, match=r"^walker_walk: dm_control is not installed\. pip install 'forbes\[dmc\]'$"):
+        DeepMindControl("walker_walk", pixels=pixels)
 
 
 def test_a_camera_that_does_not_exist_is_one_sentence(backend):
