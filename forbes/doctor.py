@@ -24,6 +24,8 @@ from forbes.envs.rendering import BACKENDS, probe_backend
 
 __all__ = ["main"]
 
+_DRIVER_LIMIT = 30.0
+"""Seconds for nvidia-smi, which takes a few where no GPU is awake."""
 REQUIRED = ("torch", "lightning", "jsonargparse", "numpy", "matplotlib", "pandas")
 OPTIONAL = {
     "scikit-image": "build",
@@ -90,11 +92,19 @@ def _gpus() -> Iterator[Finding]:
     if not torch.cuda.is_available():
         yield Finding("GPU", "none that torch can use (optional)")
     if program := shutil.which("nvidia-smi"):
-        asked = [program, "--query-gpu=driver_version", "--format=csv,noheader"]
-        answer = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=30)
-        said = (answer.stdout.strip() or answer.stderr.strip() or "no answer").splitlines()[0]
         remedy = "" if torch.cuda.is_available() else "install torch for CUDA, if there is a GPU (https://pytorch.org)"
-        yield Finding("GPU driver", f"{said}; torch is built for CUDA {torch.version.cuda or 'none'}", remedy)
+        built = f"torch is built for CUDA {torch.version.cuda or 'none'}"
+        yield Finding("GPU driver", f"{_driver(program)}; {built}", remedy)
+
+
+def _driver(program: str) -> str:
+    """Ask nvidia-smi for its version, which a broken driver lets hang."""
+    asked = [program, "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        answer = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=_DRIVER_LIMIT)
+    except subprocess.TimeoutExpired:
+        return f"nvidia-smi hangs, no answer within {_DRIVER_LIMIT:g} s"
+    return (answer.stdout.strip() or answer.stderr.strip() or "nvidia-smi says nothing").splitlines()[0]
 
 
 def _rendering() -> Iterator[Finding]:

@@ -54,8 +54,12 @@ def test_every_gpu_and_the_driver_are_named(capsys, monkeypatch, tmp_path):
     assert "install torch for CUDA" not in output
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr("forbes.doctor._DRIVER_LIMIT", 0.5)
+    program.write_text("#!/bin/sh\nexec sleep 60\n")
     assert main(["doctor"]) == 0
-    assert "install torch for CUDA" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "install torch for CUDA" in output
+    assert "nvidia-smi hangs, no answer within 0.5 s" in output
 
 
 @pytest.mark.parametrize("argument", ["surplus", "--unknown"])
