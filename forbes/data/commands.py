@@ -16,10 +16,11 @@ from rich.progress import track
 from forbes.data.classifier_training import classify, digits_of, quality, train_classifiers
 from forbes.data.dejong import dejong_path, verify_dejong
 from forbes.data.digit_classifiers import CLASSIFIERS_SHA256, classifiers_path, save_weights
+from forbes.data.download import git_blob_id
 from forbes.data.episode_commands import Add, add_episode_commands
 from forbes.data.fetch import fetch_dejong
 from forbes.data.pictures import save_picture
-from forbes.data.published import curves_path, fetch_curves
+from forbes.data.published import CURVES_BLOB, curves_path, fetch_curves
 from forbes.data.source import Split
 from forbes.data.stroke_comparison import compare_sets
 from forbes.data.stroke_extraction import extract_strokes, read_mnist
@@ -87,6 +88,9 @@ def fetch(dataset: Fetched, from_: Path | None = None) -> None:
         from_: A local copy instead of a download: of strokes the tarball, its extracted folder, or a converted `.npz`.
     """
     if dataset == "curves":
+        if from_ is None and curves_path().is_file() and git_blob_id(curves_path()) == CURVES_BLOB:
+            print(f"{curves_path()}: is there already, whole")
+            return
         fetch_curves(from_, curves_path())
         print(f"{curves_path()}: stored; figures/return.png of agents of DeepMind Control has them beside their own")
         return

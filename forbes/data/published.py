@@ -6,7 +6,7 @@ from pathlib import Path
 from forbes.data.download import data_folder, download, git_blob_id
 from forbes.errors import ForbesError
 
-__all__ = ["CURVES_URL", "curves_path", "fetch_curves"]
+__all__ = ["CURVES_BLOB", "CURVES_URL", "curves_path", "fetch_curves"]
 
 CURVES_URL = "https://github.com/danijar/dreamer/raw/master/scores/dreamer.json"
 CURVES_BLOB = "ab35b223497127c8eb4cf1b17db7afd4389c4faf"

@@ -8,6 +8,7 @@ from torch import Tensor
 from forbes.data.episodes import Episode
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.followed import followed
 from forbes.models import State
 from forbes.training.acting import ActingModel
 
@@ -19,7 +20,6 @@ SAMPLES = 16
 """S, trajectories of the belief."""
 
 
-@torch.no_grad()
 def foretell(
     agent: ActingModel, episode: Episode, seed: int, name: str, ahead: Sequence[int] = STEPS_AHEAD
 ) -> list[Tensor]:
@@ -44,19 +44,13 @@ def foretell(
     Raises:
         ForbesError: where the model foretells what is not a finite number.
     """
-    device = next(agent.parameters()).device
     steps, furthest = len(episode.reward) - 1, max(ahead)
-    observation = torch.from_numpy(episode.observation.copy()).to(device)[None]  # (1, T + 1, *O)
-    action = torch.from_numpy(episode.action.copy()).to(device)[None]  # (1, T + 1, A)
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(seed)
-        embedding = agent.model.embed(observation).expand(SAMPLES, -1, -1)  # (S, T + 1, E)
-        filtered = agent.model.filter(embedding, action.expand(SAMPLES, -1, -1))
+    with followed(agent, episode, SAMPLES, seed) as (filtered, action):
         start = State(filtered.hidden[:, :-1].flatten(0, 1), filtered.state[:, :-1].flatten(0, 1))  # (S T, ...)
-        taken = torch.cat((action[0, 1:], action.new_zeros(furthest - 1, action.shape[-1])))  # (T + K - 1, A)
+        taken = torch.cat((action[1:], action.new_zeros(furthest - 1, action.shape[-1])))  # (T + K - 1, A)
         taken = taken.unfold(0, furthest, 1).transpose(1, 2).repeat(SAMPLES, 1, 1)  # (S T, K, A)
         later = agent.reward(agent.model.imagine(start, taken).features)  # (S T, K)
-    now = agent.reward(filtered.features)[:, 1:].double().mean(0).cpu()  # (T,)
+        now = agent.reward(filtered.features)[:, 1:].double().mean(0).cpu()  # (T,)
     later = later.unflatten(0, (SAMPLES, steps)).double().mean(0).cpu()  # (T, K)
     if not (now.isfinite().all() and later.isfinite().all()):
         raise ForbesError(

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from forbes.beliefs import BeliefHead, CategoricalBelief
 from forbes.data.episodes import Episode
+from forbes.evaluation.followed import followed
 from forbes.seeding import derive_seed
 from forbes.training.acting import ActingModel
 
@@ -50,7 +51,6 @@ def non_gaussianity(head: BeliefHead, context: Tensor) -> Tensor:
     return kl
 
 
-@torch.no_grad()
 def prior_and_posterior(agent: ActingModel, episode: Episode, seed: int) -> Tensor | None:
     """Average it over the steps of an episode, for prior and posterior, float64 `(2,)`; None where s is not continuous.
 
@@ -63,12 +63,7 @@ def prior_and_posterior(agent: ActingModel, episode: Episode, seed: int) -> Tens
     heads = model.prior, model.posterior
     if any(isinstance(head, CategoricalBelief) for head in heads):
         return None
-    device = next(agent.parameters()).device
-    observation = torch.from_numpy(episode.observation.copy()).to(device)[None]  # (1, T + 1, *O)
-    action = torch.from_numpy(episode.action.copy()).to(device)[None]  # (1, T + 1, A)
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(derive_seed(seed, "gaussianity", 0))
-        filtered = model.filter(model.embed(observation), action)
-        every = -(-observation.shape[1] // _STEPS)
+    with followed(agent, episode, 1, derive_seed(seed, "gaussianity", 0)) as (filtered, _):
+        every = -(-filtered.hidden.shape[1] // _STEPS)
         contexts = model.prior_context(filtered.hidden[0, ::every]), filtered.context[0, ::every]  # 2 x (T / every, C)
         return torch.stack([non_gaussianity(*each).mean().cpu() for each in zip(heads, contexts, strict=True)])  # (2,)

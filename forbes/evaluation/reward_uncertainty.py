@@ -15,6 +15,7 @@ from torch import Tensor
 
 from forbes.data.episodes import Episode
 from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.followed import followed
 from forbes.pomdps import Process
 from forbes.seeding import generator
 from forbes.training.acting import ActingModel
@@ -50,17 +51,11 @@ def exact_variance(process: Process, episode: Episode, seed: int) -> Tensor:
     return (weight * (reward - mean).square()).sum(0)
 
 
-@torch.no_grad()
 def learned_variance(agent: ActingModel, episode: Episode, seed: int) -> Tensor:
     """Give the variance of each reward over trajectories of an agent's belief, in squared units of reward, `(T,)`."""
-    device = next(agent.parameters()).device
-    observation = torch.from_numpy(episode.observation.copy()).to(device)[None]  # (1, T + 1, *O)
-    action = torch.from_numpy(episode.action.copy()).to(device).expand(DRAWS, -1, -1)  # (S, T + 1, A)
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(seed)
-        filtered = agent.model.filter(agent.model.embed(observation).expand(DRAWS, -1, -1), action)
-    reward: Tensor = agent.reward(filtered.features)[:, 1:]  # (S, T)
-    return reward.double().var(0).cpu()
+    with followed(agent, episode, DRAWS, seed) as (filtered, _):
+        reward: Tensor = agent.reward(filtered.features)[:, 1:]  # (S, T)
+        return reward.double().var(0).cpu()
 
 
 def uncertainty(learned: Sequence[Tensor], exact: Sequence[Tensor]) -> Estimate:

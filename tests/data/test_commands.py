@@ -77,12 +77,15 @@ def test_fetch_stores_where_forbes_data_points(make_arrays, tmp_path, monkeypatc
 def test_fetched_curves_are_stored_there_too(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FORBES_DATA", str(tmp_path / "store"))
     (tmp_path / "copy.json").write_text("[]")
-    monkeypatch.setattr("forbes.data.published.CURVES_BLOB", git_blob_id(tmp_path / "copy.json"))
+    for module in ("published", "commands"):
+        monkeypatch.setattr(f"forbes.data.{module}.CURVES_BLOB", git_blob_id(tmp_path / "copy.json"))
 
     commands.main(["fetch", "curves", "--from", str(tmp_path / "copy.json")])
 
     assert (tmp_path / "store" / "dreamer-curves.json").read_text() == "[]"
     assert f"{tmp_path / 'store' / 'dreamer-curves.json'}: stored" in capsys.readouterr().out
+    commands.main(["fetch", "curves"])  # nothing is downloaded again
+    assert "is there already, whole" in capsys.readouterr().out
 
 
 def test_fetch_does_not_trust_a_stored_file_that_is_not_the_papers(make_arrays, tmp_path, monkeypatch):
