@@ -2,11 +2,12 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 from torch import Tensor, nn
 
 from forbes.deferred import Loop
+from forbes.frozen import frozen
 
 __all__ = ["BeliefFamily", "BeliefHead", "Sampler"]
 
@@ -23,6 +24,9 @@ class BeliefHead(nn.Module, ABC):
         state_dim: D, the dimension of s.
         context_dim: C, the dimension of the context.
     """
+
+    reparameterised: ClassVar[bool] = True
+    """Whether the gradient of a draw is that of a differentiable path from c to s."""
 
     def __init__(self, state_dim: int, context_dim: int) -> None:
         super().__init__()
@@ -44,6 +48,16 @@ class BeliefHead(nn.Module, ABC):
     @abstractmethod
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
         """Give log p(s | c) in nats, summed over the state: shapes `(*, D)` and `(*, C)` to `(*)`, which broadcast."""
+
+    def path_log_prob(self, state: Tensor, context: Tensor) -> Tensor:
+        r"""Return log p(s | c) as a function of s alone: neither the parameters nor the context have a gradient.
+
+        At a draw :math:`s = g(\epsilon; c, \theta)` the rest of the gradient, :math:`\partial_\theta \log p_\theta(s)`
+        with s fixed, has mean 0 and only adds variance (Roeder et al., 2017, arXiv 1703.09194; for flows Vaitl et al.,
+        2022, arXiv 2207.08219). Shapes as of `log_prob`.
+        """
+        with frozen(self):
+            return self.log_prob(state, context.detach())
 
     def sampler(self, loop: Loop) -> Sampler:
         """Prepare `rsample` for a time loop: what does not depend on the context is computed once, here.

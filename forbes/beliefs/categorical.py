@@ -29,6 +29,8 @@ class CategoricalBelief(BeliefHead):
         ForbesError: when `state_dim` is no multiple of `classes`, or `kl_balance` is outside [0, 1].
     """
 
+    reparameterised = False
+
     def __init__(self, state_dim: int, context_dim: int, classes: int = 32, kl_balance: float | None = None) -> None:
         super().__init__(state_dim, context_dim)
         if state_dim % classes:

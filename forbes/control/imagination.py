@@ -9,16 +9,12 @@ reward that comes with it belongs to that next state, as it does in stored seque
     returns                 V1         V2                 V1 = r1 + γ[(1 - λ) v2 + λ V2],  V2 = r2 + γ v3
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import torch
-from torch import nn
 
 from forbes.models import Filtered, State, StateSpaceModel
 from forbes.precision import full_precision
 
-__all__ = ["belief_samples", "frozen"]
+__all__ = ["belief_samples"]
 
 
 def belief_samples(model: StateSpaceModel, filtered: Filtered, number: int) -> State:
@@ -30,20 +26,3 @@ def belief_samples(model: StateSpaceModel, filtered: Filtered, number: int) -> S
         more, _ = model.posterior.rsample(filtered.context, (number - 1,))  # (N - 1, B, T, D)
     state = torch.cat((filtered.state[None], more)).detach()  # (N, B, T, D)
     return State(filtered.hidden.detach().expand(number, -1, -1, -1), state)
-
-
-@contextmanager
-def frozen(*modules: nn.Module) -> Iterator[None]:
-    """Build a graph through modules that leaves their parameters out; `no_grad` would cut the path to the actions.
-
-    Stand-ins that share their memory take the parameters' places: the compiler cannot follow `requires_grad_`.
-    """
-    held = [(part, dict(part._parameters)) for module in modules for part in module.modules()]
-    for part, parameters in held:
-        stand_ins = {name: parameter.detach() for name, parameter in parameters.items() if parameter is not None}
-        part._parameters.update(stand_ins)  # type: ignore[arg-type]
-    try:
-        yield
-    finally:
-        for part, parameters in held:
-            part._parameters.update(parameters)

@@ -45,6 +45,8 @@ class SequenceSource(ABC):
     """A, 0 for a process without actions."""
     discrete: bool = False
     """Whether an action is one of A, as a one-hot vector."""
+    increments: bool = False
+    """Whether o_t is what step t adds to a picture, not the picture itself: then pictures show the sum up to t."""
     watermark: int | None = None
     """Up to where a source that grows was read; a checkpoint keeps it, and a resumed run sets it again."""
 

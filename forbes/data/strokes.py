@@ -34,12 +34,18 @@ def bundled_path() -> Path:
 class Strokes(SequenceSource):
     r"""MNIST digits as they are written, rendered on the fly from the pen's path.
 
-    Frame t is binary and cumulative: with k points a step, :math:`o_t[y, x] = 1` where one of the first
-    :math:`\min(kt, n)` of the digit's n points is (x, y), t = 1, 2, …. There are no actions and no rewards::
+    With k points a step, step t adds the points :math:`k(t-1)+1, …, \min(kt, n)` of the digit's n points. A whole
+    frame shows all pixels visited so far, a written frame those that step t has visited first. Both are binary, and
+    one is a bijection of the other, so the log-probability of a sequence is the same for both:
 
-        k = 2, n = 5     t      1     2     3     4
-                         points 1-2   1-4   1-5   1-5
-                         mask   true  true  true  false
+    .. math:: w_t = x_t - x_{t-1}, \qquad x_t = \sum_{u \le t} w_u, \qquad x_0 = 0
+
+    There are no actions and no rewards::
+
+        k = 2, n = 5     t        1     2     3     4
+                         whole    1-2   1-4   1-5   1-5
+                         written  1-2   3-4   5     none
+                         mask     true  true  true  false
 
     Args:
         origin: ``bundled``, our own extraction from the MNIST images, comes with the package; ``dejong`` is the
@@ -47,6 +53,9 @@ class Strokes(SequenceSource):
         path: Read this file instead of the origin's own.
         points_per_step: Points that each frame adds. 1 is the paper's; 2 shows 99 % of the digits whole in 30 frames.
         validation: The last so many training digits are the validation split.
+        frames: ``written``, what each step adds: at one point a step one pixel, or none where the pen crosses its own
+            path. ``whole``, the paper's, show the first t points; their likelihood is mostly that of the past, drawn
+            again.
     """
 
     observation_shape = (1, SIDE, SIDE)
@@ -58,6 +67,7 @@ class Strokes(SequenceSource):
         path: str | None = None,
         points_per_step: int = 1,
         validation: int = 5000,
+        frames: Literal["written", "whole"] = "written",
     ) -> None:
         if points_per_step < 1:
             raise ForbesError(f"Strokes: points_per_step is {points_per_step}, expected at least 1.")
@@ -67,6 +77,7 @@ class Strokes(SequenceSource):
         self.path = path
         self.points_per_step = points_per_step
         self.validation = validation
+        self.increments = frames == "written"
 
     @cached_property
     def _splits(self) -> dict[Split, StrokeArrays]:
@@ -130,7 +141,7 @@ class Strokes(SequenceSource):
     def decode(self, compact: StrokePoints) -> SequenceBatch:
         """Render frames from points, on the device the points lie on.
 
-        A pixel is on from its first visit onwards, so one comparison of first visits with t gives all frames.
+        A pixel is written at its first visit and on from there, so one comparison of first visits with t gives all.
         """
         points, number = compact
         batch, device = len(points), points.device
@@ -140,9 +151,10 @@ class Strokes(SequenceSource):
         pixel = points[..., 1].long() * SIDE + points[..., 0]  # (B, P)
         never = torch.full((batch, SIDE * SIDE), length, device=device)
         first_visit = never.scatter_reduce(1, pixel, step, "amin")  # (B, H * W)
-        frames = (first_visit[:, None] <= time[:, None]).to(torch.uint8)  # (B, T, H * W)
+        first_visit, step = first_visit[:, None], time[:, None]  # (B, 1, H * W), (T, 1)
+        frames = first_visit == step if self.increments else first_visit <= step  # (B, T, H * W)
         return SequenceBatch(
-            observation=frames.view(batch, length, 1, SIDE, SIDE),  # (B, T, 1, H, W)
+            observation=frames.to(torch.uint8).view(batch, length, 1, SIDE, SIDE),  # (B, T, 1, H, W)
             action=torch.zeros(batch, length, 0, device=device),
             reward=torch.zeros(batch, length, device=device),
             mask=time * self.points_per_step < number[:, None],  # (B, T)

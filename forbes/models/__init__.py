@@ -2,7 +2,7 @@
 
 from forbes.models.base import BeliefModel, ModelFamily, Prediction, Rollout, Seen, State
 from forbes.models.elbo import ElboTerms, elbo_loss
-from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, VectorNormal
+from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, OnePixel, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
 from forbes.models.particles import ParticleModel
 from forbes.models.state_space import Filtered, StateSpaceModel
@@ -21,6 +21,7 @@ __all__ = [
     "ModelFamily",
     "Normal",
     "OneHot",
+    "OnePixel",
     "ParticleModel",
     "Prediction",
     "Rollout",

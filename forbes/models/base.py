@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from forbes.beliefs import BeliefFamily
-from forbes.models.elbo import ElboTerms
+from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, Perceptron
 
@@ -114,8 +114,15 @@ class BeliefModel(nn.Module, ABC):
         """Give (h_0, s_0), `(B, ...)`: what is carried before anything was seen."""
 
     @abstractmethod
-    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
-        """Estimate the lower bound of log p(o_1:T) that the model is trained by; arguments as in `SequenceBatch`."""
+    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+        """Estimate the lower bound of log p(o_1:T) that the model is trained by.
+
+        Args:
+            observation: as in `SequenceBatch`, like the next two.
+            action: a_{t-1}.
+            mask: True where the step counts.
+            kl: how the KL is differentiated, where the model has one.
+        """
 
     @abstractmethod
     def beliefs(self, seen: Seen, samples: int) -> State:

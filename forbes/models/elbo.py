@@ -5,9 +5,17 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
-__all__ = ["ElboTerms", "FreeNats", "elbo_loss"]
+__all__ = ["KL", "ElboTerms", "FreeNats", "elbo_loss"]
 
 FreeNats = Literal["batch", "element"]
+KL = Literal["analytic", "monte_carlo", "path"]
+"""How the KL is differentiated; its expected gradient is the same.
+
+- analytic: the closed form where prior and posterior have one, else as path.
+- path: log q(s) - log p(s) at the posterior's sample, where log q is a function of s alone (`path_log_prob`); where
+  draws are not reparameterised, as monte_carlo.
+- monte_carlo: the same, where log q is a function of its parameters too.
+"""
 
 
 class ElboTerms(NamedTuple):
@@ -21,7 +29,7 @@ class ElboTerms(NamedTuple):
     kl: Tensor
     """log q(s_t) - log p(s_t) at the posterior's own sample, `(B, T)`: what is reported, for every family."""
     analytic_kl: Tensor | None
-    """The closed form of its expectation given (h_t, e_t), `(B, T)`, where the family has one."""
+    """The closed form of its expectation given (h_t, e_t), `(B, T)`, where it was asked for and the family has one."""
     mask: Tensor
     """True where the step counts, `(B, T)`."""
     auxiliary: Mapping[str, Tensor] = {}

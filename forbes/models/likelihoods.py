@@ -6,12 +6,12 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 from torch.distributions import Categorical
-from torch.nn.functional import log_softmax, one_hot, softplus
+from torch.nn.functional import log_softmax, one_hot, pad, softplus
 
 from forbes.errors import ForbesError
 from forbes.fusion import fused
 
-__all__ = ["Bernoulli", "Likelihood", "Normal", "OneHot", "VectorNormal"]
+__all__ = ["Bernoulli", "Likelihood", "Normal", "OneHot", "OnePixel", "VectorNormal"]
 
 
 class Likelihood(ABC):
@@ -20,6 +20,9 @@ class Likelihood(ABC):
     name: str
     rank: int
     """Dimensions of an observation: 3 of an image `(C, H, W)`, 1 of a vector `(O,)`."""
+
+    def check(self, observation: Tensor) -> None:  # noqa: B027  # most likelihoods take any value
+        """Raise a ForbesError where stored observations `(*, *O)` have a value outside the density's support."""
 
     @abstractmethod
     def target(self, observation: Tensor) -> Tensor:
@@ -47,6 +50,15 @@ class Bernoulli(Likelihood):
 
     name, rank = "bernoulli", 3
 
+    def check(self, observation: Tensor) -> None:
+        """See `Likelihood.check`: values 0 and 1."""
+        least, most = observation.min().item(), observation.max().item()
+        if not 0 <= least <= most <= 1:
+            raise ForbesError(
+                f"{type(self).__name__}: observations have values from {least:g} to {most:g}, expected 0 and 1. Use "
+                "Normal as model.likelihood"
+            )
+
     def target(self, observation: Tensor) -> Tensor:
         """See `Likelihood.target`: 0/1 as they are."""
         return observation.float()
@@ -62,6 +74,53 @@ class Bernoulli(Likelihood):
     def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
         """See `Likelihood.log_prob`."""
         return (output * target - softplus(output)).sum((-3, -2, -1))
+
+
+class OnePixel(Likelihood):
+    r"""The one pixel i that is on, or none: the output u has a logit for each pixel, that of none is 0.
+
+    .. math:: \log p(i) = u_i - \log\left(1 + \sum_j e^{u_j}\right), \qquad
+              \log p(\text{none}) = -\log\left(1 + \sum_j e^{u_j}\right)
+
+    A softmax does not change when all logits move together, so a fixed one loses nothing. Shapes are those of images,
+    `(C, H, W)`, of which i counts all C H W values.
+    """
+
+    name, rank = "categorical", 3
+
+    def check(self, observation: Tensor) -> None:
+        """See `Likelihood.check`: values 0 and 1, no more than one 1 in a frame."""
+        Bernoulli().check(observation)
+        most = int(observation.flatten(-3).sum(-1, dtype=torch.long).max())
+        if most > 1:
+            raise ForbesError(
+                f"OnePixel: a frame has {most} pixels that are on, expected at most 1. Use Bernoulli as "
+                "model.likelihood; of strokes, frames: written with points_per_step: 1 have one"
+            )
+
+    def target(self, observation: Tensor) -> Tensor:
+        """See `Likelihood.target`: 0/1 as they are."""
+        return observation.float()
+
+    def mean(self, output: Tensor) -> Tensor:
+        """See `Likelihood.mean`: the probability of each pixel."""
+        return (output - self._log_sum(output)[..., None, None, None]).exp()
+
+    def sample(self, output: Tensor) -> Tensor:
+        """See `Likelihood.sample`."""
+        logits = pad(output.flatten(-3), (0, 1))  # (*, C H W + 1)
+        pixel = Categorical(logits=logits).sample()  # (*)
+        drawn = one_hot(pixel, logits.shape[-1])[..., :-1]  # (*, C H W)
+        return drawn.to(output.dtype).view(output.shape)  # (*, C, H, W)
+
+    def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
+        """See `Likelihood.log_prob`."""
+        return (output * target).sum((-3, -2, -1)) - self._log_sum(output)
+
+    @staticmethod
+    def _log_sum(output: Tensor) -> Tensor:
+        """Return log(1 + Σ exp u): `(*, C, H, W)` to `(*)`."""
+        return softplus(output.logsumexp((-3, -2, -1)))
 
 
 class Normal(Likelihood):

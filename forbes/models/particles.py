@@ -23,7 +23,7 @@ from torch import Tensor
 from forbes.beliefs import BeliefFamily
 from forbes.errors import ForbesError
 from forbes.models.base import Prediction, Seen, State
-from forbes.models.elbo import ElboTerms
+from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder
 from forbes.models.state_space import StateSpaceModel
@@ -189,8 +189,8 @@ class ParticleModel(StateSpaceModel):
         """See `BeliefModel.bound_name`."""
         return f"fivo[{self.likelihood.name},K={self.particles}]"
 
-    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
-        r"""Estimate the bound with K particles; arguments as in `SequenceBatch`.
+    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+        r"""See `BeliefModel.elbo`: with K particles.
 
         The reconstruction is the weighted mean :math:`\sum_k W_t^k \log p(o_t \mid h_t^k, s_t^k)`, the KL what it
         exceeds :math:`\log \hat p_t` by.

@@ -20,7 +20,7 @@ from forbes.beliefs import BeliefFamily, BeliefHead
 from forbes.deferred import Affine, Loop
 from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
-from forbes.models.elbo import ElboTerms
+from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, Perceptron, bind_gru
 from forbes.precision import full_precision
@@ -191,19 +191,22 @@ class StateSpaceModel(BeliefModel):
         features = self.predict(self.filter(seen.embedding, seen.action))
         return Prediction(features[None], features.new_zeros(1, *features.shape[:2]))  # (1, B, T, H + D), (1, B, T)
 
-    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
-        """Estimate the bound with one posterior trajectory per sequence; arguments as in `SequenceBatch`."""
+    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+        """See `BeliefModel.elbo`: with one posterior trajectory per sequence."""
         seen = self.see(observation, action)
-        return self.bound(self.filter(seen.embedding, action), seen, mask)
+        return self.bound(self.filter(seen.embedding, action), seen, mask, kl)
 
-    def bound(self, filtered: Filtered, seen: Seen, mask: Tensor) -> ElboTerms:
+    def bound(self, filtered: Filtered, seen: Seen, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Estimate the bound with the posterior trajectory that `filter` has drawn for what was seen."""
         reconstruction = self.log_likelihood(filtered.features, seen.target)
         with full_precision(filtered.state):
             prior_context = self.prior_context(filtered.hidden)  # (B, T, C)
-            kl = filtered.log_prob - self.prior.log_prob(filtered.state, prior_context)
-            analytic_kl = self.posterior.kl(filtered.context, self.prior, prior_context)
-        return ElboTerms(reconstruction, kl, analytic_kl, mask)
+            analytic = self.posterior.kl(filtered.context, self.prior, prior_context) if kl == "analytic" else None
+            log_posterior = filtered.log_prob
+            if analytic is None and kl != "monte_carlo" and self.posterior.reparameterised:
+                log_posterior = self.posterior.path_log_prob(filtered.state, filtered.context)  # (B, T)
+            sampled = log_posterior - self.prior.log_prob(filtered.state, prior_context)  # (B, T)
+        return ElboTerms(reconstruction, sampled, analytic, mask)
 
     @staticmethod
     def _bind(network: Perceptron, known: Tensor, loop: Loop) -> Affine:

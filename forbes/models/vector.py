@@ -19,7 +19,7 @@ from forbes.beliefs import BeliefFamily
 from forbes.deferred import Loop
 from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
-from forbes.models.elbo import ElboTerms
+from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, bind_gru
 from forbes.precision import full_precision
@@ -116,7 +116,7 @@ class VectorModel(BeliefModel):
         """See `BeliefModel.draws`: one is as good as many."""
         return 1
 
-    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
+    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Give log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the roll-out beside them."""
         seen = self.see(observation, action)
         hidden = self.filter(seen.embedding, action)

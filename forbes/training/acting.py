@@ -93,7 +93,7 @@ class ActingModel(WorldModel, ABC):
 
     def model_objective(self, filtered: Filtered, seen: Seen, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """Give the loss of model and reward in nats per step, and what is logged of it, along a trajectory."""
-        terms = self.model.bound(filtered, seen, batch.mask)
+        terms = self.model.bound(filtered, seen, batch.mask, self.kl)
         means = {name: terms.mean_over_steps(values) for name, values in self.log_probs(filtered, batch).items()}
         loss = self.loss(terms) - sum(means.values())
         return loss, self.measures(terms) | {name: mean.detach() for name, mean in means.items()}

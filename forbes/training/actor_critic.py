@@ -7,11 +7,12 @@ from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
 from forbes.control.agent import Choice, explore, take_mode
-from forbes.control.imagination import belief_samples, frozen
+from forbes.control.imagination import belief_samples
 from forbes.control.policy import Actor, Policy, ScalarHead
 from forbes.control.returns import actor_loss, critic_loss, lambda_returns
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
+from forbes.frozen import frozen
 from forbes.models import Filtered, State
 from forbes.models.networks import activate
 from forbes.training.acting import ActingModel

@@ -14,7 +14,7 @@ from forbes.beliefs import BeliefFamily, FlowBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.models.base import ModelFamily
-from forbes.models.elbo import ElboTerms, FreeNats, elbo_loss
+from forbes.models.elbo import KL, ElboTerms, FreeNats, elbo_loss
 from forbes.models.likelihoods import Likelihood, Normal, VectorNormal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
 from forbes.models.state_space import StateSpaceModel
@@ -53,7 +53,9 @@ class WorldModel(LightningModule):
         mlp_dim: width of every perceptron.
         mlp_layers: layers of every perceptron.
         activation: of every perceptron; convolutions and flows keep their ReLU.
-        kl: "analytic" trains with the closed form where the family has one, "monte_carlo" never.
+        kl: how the KL is differentiated. "analytic" by its closed form where the family has one, else as "path": at the
+            posterior's sample, through the sample alone; "monte_carlo" through the posterior's parameters too, a noise
+            that costs a flow thousands of updates.
         free_nats: the KL below this, in nats per step, costs nothing in training.
         free_nats_per: "batch" applies them to the mean over batch and time, "element" to each step.
         kl_warmup: updates over which the weight of the KL rises from 0 to 1.
@@ -85,7 +87,7 @@ class WorldModel(LightningModule):
         mlp_dim: int = 200,
         mlp_layers: int = 2,
         activation: Activation = "relu",
-        kl: Literal["analytic", "monte_carlo"] = "analytic",
+        kl: KL = "analytic",
         free_nats: float = 3.0,
         free_nats_per: FreeNats = "batch",
         kl_warmup: int = 0,
@@ -129,10 +131,12 @@ class WorldModel(LightningModule):
 
     def terms(self, batch: SequenceBatch) -> ElboTerms:
         """Estimate the parts of the bound on a batch."""
-        return self.model.elbo(batch.observation, batch.action, batch.mask)
+        return self.model.elbo(batch.observation, batch.action, batch.mask, self.kl)
 
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
-        """Seed the noise of this update, so that a resumed run draws the same."""
+        """Seed the noise of this update, so that a resumed run draws the same; look at an epoch's first observations."""
+        if batch_idx == 0:
+            self.model.likelihood.check(batch.observation)
         torch.manual_seed(derive_seed(self.seed, "update", self.global_step))
         if self.model.center is not None and self.global_step == 0:
             self.model.center.copy_(self.model.likelihood.target(batch.observation)[batch.mask].mean(0))  # (*O)
@@ -157,8 +161,6 @@ class WorldModel(LightningModule):
 
     def loss(self, terms: ElboTerms) -> Tensor:
         """Give the loss of this update in nats per step, a scalar."""
-        if self.kl == "monte_carlo":
-            terms = terms._replace(analytic_kl=None)
         weight = min(1.0, (self.global_step + 1) / self.kl_warmup) if self.kl_warmup else 1.0
         return elbo_loss(terms, self.free_nats, self.free_nats_per, weight)
 

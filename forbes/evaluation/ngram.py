@@ -1,0 +1,119 @@
+r"""n-grams of pen moves: what digit strokes are worth to a model that has never seen a picture.
+
+A move m_t leads from a pixel of the pen's path to the next: to one of its 8 neighbours, or by a jump to any pixel x.
+
+.. math::
+
+    \log p(x_{1:T}) = \log p_1(x_1) + \sum_{t>1} \log p_n(m_t \mid m_{t-n}, \dots, m_{t-1})
+                      + [m_t \text{ is a jump}] \log p_J(x_t)
+
+    p_n(m \mid c) = \frac{N(c, m) + \alpha\, p_{n-1}(m \mid c')}{N(c) + \alpha}, \qquad p_{-1} = \tfrac19
+
+N counts the training split, c' is the context c less its earliest move, and :math:`\alpha = 5`. First pixels
+:math:`p_1` and targets of jumps :math:`p_J` are empirical, with as many pseudo-counts spread over all pixels. The path
+determines the frames, so this is a lower bound of their log-probability: a model of frames below it has not learned how
+a pen moves.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forbes.data import Split, Strokes
+from forbes.data.stroke_file import SIDE
+from forbes.data.strokes import StrokePoints
+
+__all__ = ["ORDERS", "NGrams", "fit_ngrams"]
+
+ORDERS = (1, 2, 3, 4, 5)
+_JUMP, _START, _SYMBOLS = 8, 9, 10
+"""Moves are 0 to 7, or a jump; a context may also reach back to before the first move."""
+_PSEUDO_COUNTS = 5.0
+
+
+class _Moves(NamedTuple):
+    """Pen paths as moves; t counts points."""
+
+    pixel: Tensor
+    """x_t, int64 `(B, P)`."""
+    move: Tensor
+    """m_t that leads to x_t, int64 `(B, P)`; the first is `_START`."""
+    valid: Tensor
+    """True where the point is no padding, `(B, P)`."""
+
+
+class NGrams:
+    """n-grams of all `ORDERS`, fitted on the training digits up to some length.
+
+    Args:
+        source: of the strokes.
+        length: T; later points of longer digits do not count.
+    """
+
+    def __init__(self, source: Strokes, length: int) -> None:
+        self.source, self.length = source, length
+        pixel, move, valid = self._moves("train", source.size("train"))
+        later = valid & (move != _START)
+        self.counts = []
+        for order in range(max(ORDERS) + 1):
+            place = _context(move, order) * (_JUMP + 1) + move  # (B, P)
+            size = _SYMBOLS**order * (_JUMP + 1)
+            self.counts.append(torch.bincount(place[later], minlength=size).view(-1, _JUMP + 1).double())
+        self.first = _log_share(pixel[:, 0])  # (H W,)
+        self.target = _log_share(pixel[later & (move == _JUMP)])  # (H W,)
+
+    def log_prob(self, split: Split, count: int) -> dict[int, Tensor]:
+        """Return log p of each step of the first `count` digits in nats, by order, float64 `(N, T)`; 0 on padding."""
+        pixel, move, valid = self._moves(split, count)
+        begins, jumps = move == _START, move == _JUMP
+        place = self.first[pixel] * begins + self.target[pixel] * jumps  # (N, P)
+        share = torch.full_like(place, 1 / (_JUMP + 1))  # (N, P)
+        index = move.clamp(max=_JUMP)[..., None]
+        found = {}
+        for order, counts in enumerate(self.counts):
+            of_context = counts[_context(move, order)]  # (N, P, 9)
+            number = of_context.gather(-1, index)[..., 0]  # (N, P)
+            share = (number + _PSEUDO_COUNTS * share) / (of_context.sum(-1) + _PSEUDO_COUNTS)
+            log_prob = (place + share.log() * ~begins) * valid  # (N, P)
+            found[order] = log_prob.unflatten(1, (self.length, -1)).sum(-1)  # (N, T)
+        return {order: found[order] for order in ORDERS}
+
+    def _moves(self, split: Split, count: int) -> _Moves:
+        points, number = self.source.gather(split, torch.arange(count), self.length)
+        return _moves(StrokePoints(points, number))
+
+
+@lru_cache(maxsize=2)
+def fit_ngrams(source: Strokes, length: int) -> NGrams:
+    """Return the n-grams of a source, fitted once."""
+    return NGrams(source, length)
+
+
+def _moves(paths: StrokePoints) -> _Moves:
+    x, y = paths.points.long().unbind(-1)  # 2 x (B, P)
+    dx, dy = x.diff(dim=1), y.diff(dim=1)  # 2 x (B, P - 1)
+    square = 3 * (dx + 1) + dy + 1  # 0 … 8 among the neighbours, 4 the pixel itself
+    near = (dx.abs() <= 1) & (dy.abs() <= 1) & (square != 4)
+    move = torch.where(near, square - (square > 4).long(), _JUMP)  # (B, P - 1)
+    start = torch.full_like(move[:, :1], _START)
+    valid = torch.arange(x.shape[1]) < paths.number[:, None]  # (B, P)
+    return _Moves(SIDE * y + x, torch.cat((start, move), 1), valid)  # (B, P)
+
+
+def _context(move: Tensor, order: int) -> Tensor:
+    """Number the last `order` moves before each one: `(B, P)` to 0 … 10^order - 1, `(B, P)`."""
+    context = torch.zeros_like(move)
+    for back in range(1, order + 1):
+        before = torch.full_like(move, _START)
+        before[:, back:] = move[:, :-back]
+        context = context * _SYMBOLS + before
+    return context
+
+
+def _log_share(pixel: Tensor) -> Tensor:
+    """Return the logarithm of how often each pixel occurs, smoothed, float64 `(H W,)`."""
+    count = torch.bincount(pixel, minlength=SIDE * SIDE).double()
+    smooth = count + _PSEUDO_COUNTS / len(count)
+    return (smooth / smooth.sum()).log()
