@@ -158,7 +158,13 @@ def _write(comparison: Comparison, families: Sequence[Family], folder: Path, com
     """Write tables and pictures, and print the table."""
     text = markdown(comparison, families)
     tables = {name: _records(getattr(comparison, name)) for name in ("scores", "differences")}
-    record = {"command": command, "commit": commit(), **tables, "curves": comparison.curves}
+    record = {
+        "command": command,
+        "commit": commit(),
+        **tables,
+        "curves": comparison.curves,
+        "references": comparison.references,
+    }
     replace_file(folder / "comparison.csv", comparison.scores.to_csv(index=False).encode())
     replace_file(folder / "comparison.json", (json.dumps(record, indent=2) + "\n").encode())
     replace_file(folder / "comparison.md", text.encode())
