@@ -22,8 +22,8 @@ ONE_EPOCH = ["--", "--trainer.max_epochs", "1"]
 MEASURES = ["--samples", "2", "--particles", "2", "--futures", "2", "--context", "2"]
 
 
-def in_this_process(arguments):
-    return main(["fit", *arguments])
+def in_this_process(jobs, at_once):
+    return {job.name: main(job.command[job.command.index("fit") :]) for job in jobs}
 
 
 def configuration_in_this_process(config, *flags):
@@ -36,7 +36,7 @@ def configuration_in_this_process(config, *flags):
 def one_process():
     """A process of its own would spend most of a test on its imports."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compare_command, "_forbes_fit", in_this_process)
+        patch.setattr(compare_command, "run_jobs", in_this_process)
         patch.setattr(compare_command, "_configuration", configuration_in_this_process)
         yield
 
@@ -191,15 +191,14 @@ def test_other_noise_is_measured_anew(configs, compared, tmp_path):
 def test_it_goes_on_where_it_was_stopped(configs, tmp_path, monkeypatch):
     """Killed in the second training, then between the measurement of one run and that of another."""
     command = ["compare", *configs, "--scores", "elbo", "-o", str(tmp_path), *MEASURES, *ONE_EPOCH]
-    fits, measure = [], compare_command.evaluate
+    measure = compare_command.evaluate
 
-    def killed_in_the_second(arguments):
-        fits.append(arguments)
-        return in_this_process(arguments) if len(fits) == 1 else 143
+    def killed_in_the_second(jobs, at_once):
+        return in_this_process(jobs[:1], at_once) | {jobs[1].name: 143}
 
-    monkeypatch.setattr(compare_command, "_forbes_fit", killed_in_the_second)
+    monkeypatch.setattr(compare_command, "run_jobs", killed_in_the_second)
     assert main(command) == 2
-    monkeypatch.setattr(compare_command, "_forbes_fit", in_this_process)
+    monkeypatch.setattr(compare_command, "run_jobs", in_this_process)
     monkeypatch.setattr(compare_command, "evaluate", lambda runs, *rest: measure(runs[:1], *rest) and 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(command)
@@ -270,6 +269,8 @@ def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_
     twin = tmp_path / "rssm.yaml"
     twin.write_text(Path(configs[0]).read_text())
     assert "another configuration is called rssm" in error_of(configs[0], str(twin))
-    assert "its training ended with status 2" in error_of(configs[0], "--", "--model.no_such_key", "1")
+    failed = error_of(configs[0], "--", "--model.no_such_key", "1")
+    assert "trainings that failed: " in failed
+    assert "rssm-0 with status 2" in failed
     with pytest.raises(Exception, match=r"rssm-0: evaluation.json has no test/bleu"):
         compare(families, ["test/bleu"])
