@@ -24,7 +24,8 @@ def print_runs(measured: Sequence[Measured]) -> None:
     """Print every metric of every run; n/a where its model does not have it."""
     console = _console()
     for number, one in enumerate(measured, start=1):
-        console.print(f"{number}  {escape(one.run.path)}: {one.run.family}, {one.run.parameters:,} parameters")
+        text = f"{number}  {escape(one.run.path)}: {one.run.family}, {one.run.parameters:,} parameters"
+        console.print(text, soft_wrap=True)
     columns = {
         str(number): {name: _cell(name, entry) for name, entry in one.entries.items()}
         for number, one in enumerate(measured, start=1)
@@ -44,7 +45,8 @@ def print_references(measured: Sequence[Measured]) -> None:
     _print(console, "log p of the same steps by models without a belief, nats per sequence", columns)
     below = [one.run.path for one in measured if any(beaten_by(entry) for entry in one.entries.values())]
     if below:
-        console.print(f"<: below this reference, so less was learned than it knows: {escape(', '.join(below))}")
+        text = f"<: below this reference, so less was learned than it knows: {escape(', '.join(below))}"
+        console.print(text, soft_wrap=True)
 
 
 def beaten_by(entry: Mapping[str, Any]) -> str | None:
@@ -89,8 +91,9 @@ def _print(console: Console, title: str, columns: Mapping[str, Mapping[str, str]
         header: max(len(line) for cell in (header, *cells.values()) for line in cell.split("\n")) + 3
         for header, cells in columns.items()
     }
+    console.print(f"\n{escape(title)}", soft_wrap=True)
     for headers in _fitting(widths, room):
-        table = Table(title=escape(title))
+        table = Table()
         table.add_column("score", no_wrap=True)
         for header in headers:
             table.add_column(escape(header), justify="right", no_wrap=True)
