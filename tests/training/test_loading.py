@@ -91,3 +91,17 @@ def test_a_run_does_not_go_on_with_another_family(run, capsys):
     assert status == 2
     assert "last.ckpt: it has no model.prior." in capsys.readouterr().err
     assert run.config.read_text() == before
+
+
+def test_a_run_from_before_written_frames_has_whole_ones(tiny_run, tmp_path):
+    run = shutil.copytree(tiny_run, tmp_path / "run")
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["data"]["init_args"]["source"]["init_args"].pop("frames") == "written"
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+
+    assert load_run(run)[1].source.frames == "whole"
+
+    assert main(["fit", "--resume", str(run), "--trainer.max_epochs", "3"]) == 0
+    resumed = yaml.safe_load((run / "config.yaml").read_text())
+    assert resumed["data"]["init_args"]["source"]["init_args"]["frames"] == "whole"
+    assert load_run(run)[1].source.frames == "whole"

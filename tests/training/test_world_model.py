@@ -9,7 +9,8 @@ from lightning import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
-from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief
+from forbes.cli import main
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.models import (
@@ -326,3 +327,23 @@ def test_an_update_changes_every_parameter_sooner_or_later():
     fit(model, updates=3)
 
     assert [name for name, p in model.named_parameters() if torch.equal(p, before[name])] == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"belief": partial(CategoricalBelief, classes=2)}, "draws of a CategoricalBelief are not reparameterised"),
+        ({"belief": GaussianBelief, "model": ParticleModel}, "kl is path for a ParticleModel, expected analytic"),
+    ],
+)
+def test_a_path_derivative_that_does_not_exist_is_refused(flags, message):
+    with pytest.raises(ForbesError, match=message):
+        make_world_model(kl="path", **flags)
+
+
+def test_the_first_batch_must_have_a_density(tiny_config, tmp_path, capsys):
+    flags = ["--model.likelihood", "OnePixel", "--data.source.points_per_step", "2"]
+
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", str(tmp_path / "run"), *flags]) == 2
+
+    assert "OnePixel: a frame has 2 pixels that are on, expected at most 1" in capsys.readouterr().err
