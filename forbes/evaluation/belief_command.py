@@ -1,6 +1,5 @@
 """`forbes beliefs`: how far learned beliefs of a known process are from its exact one."""
 
-import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -27,7 +26,7 @@ from forbes.seeding import derive_seed, generator
 from forbes.training import KnownBelief
 from forbes.training.known_model import has_transition_density
 from forbes.training.loading import load_known_belief
-from forbes.training.provenance import commit
+from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
@@ -73,7 +72,7 @@ def main(argv: Sequence[str]) -> None:
         began = time.monotonic()
         scores = _learned(run, args)
         origin = {
-            "command": shlex.join(["forbes", "beliefs", *argv]),
+            "command": command_line("beliefs", *argv),
             "commit": commit(),
             "seed": args.seed,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -134,7 +134,10 @@ def test_what_cannot_be_measured_is_one_sentence(run, tiny_run, tmp_path, capsys
         (["beliefs", run], f"--sequences 200: the test split of {run} has 12, expected 2 to that"),
         (["beliefs", run, "--sequences", "1"], "--sequences 1: "),
         (["beliefs", run, other, *few], f"{other}: its data are Simulated("),
-        (["beliefs", mixed, *few], "the data are those of MountainHike with numbers of its own"),
+        (
+            ["beliefs", mixed, *few],
+            "those of MountainHike(start=multi, observation_std=1.5), expected those of its MountainHike(start=multi, ",
+        ),
         (["beliefs", tmp_path / "absent"], "absent: no such run folder"),
     ]:
         assert sentence in error_of(capsys, *arguments)
