@@ -154,6 +154,30 @@ def test_a_belief_that_is_not_finite_is_named(run, capsys):
     assert f"{run}: the state_nll_regret of sequence 0 is nan" in sentence
 
 
+def test_an_infinite_reverse_kl_is_reported_as_a_share_of_sequences(tmp_path, capsys):
+    """A Gaussian reaches beyond an exact belief of bounded support: infinite is the answer, not a diverged training."""
+    allow = ["--allow-module", "bounded_process"]
+    run = fit(tmp_path, "{class_path: bounded_process.Box}", *allow)
+    capsys.readouterr()
+
+    assert beliefs(run, "--sequences", "12", *allow) == 0
+
+    entries, out = record(run), capsys.readouterr().out
+    with np.load(run / "evaluation.npz") as arrays:
+        infinite = np.isinf(arrays["test/reverse_kl[S=5]"]).mean()
+        assert all(np.isfinite(arrays[f"test/{metric}[S=5]"]).all() for metric in ("forward_kl", "variance_ratio"))
+    assert infinite > 0
+    reverse, forward = (entries[f"test/{metric}[S=5]"] for metric in ("reverse_kl", "forward_kl"))
+    assert (reverse["mean"], reverse["per_step"]["mean"], reverse["infinite"]) == (None, None, infinite)
+    assert forward["infinite"] == 0
+    assert f"inf in {infinite:.1%}" in out
+    matched = next(line for line in out.splitlines() if "moment-matched" in line)
+    forward_kl, reverse_kl, regret, ratio = (cell.strip() for cell in matched.split("│")[3:7])
+    assert reverse_kl.startswith("inf in ")
+    assert all("±" in cell for cell in (forward_kl, regret, ratio))
+    assert "nan" not in out
+
+
 def test_a_flow_learns_two_modes_where_the_best_gaussian_cannot(tmp_path, capsys):
     """The goal on the mirror sensor: at most 0.05 nats a step from the exact belief, by a proper score."""
     config = str(Path(__file__).parents[2] / "configs" / "pomdp" / "mirror_sensor" / "known_spline.yaml")
