@@ -108,6 +108,33 @@ def test_equals_a_plain_loop_over_sequences_and_steps(likelihood, batch_size, mo
     torch.testing.assert_close(scores["reconstruction"] - scores["kl"], scores["elbo"])
 
 
+def plain_future(model, observation, action, context):
+    """log p of each later frame of one sequence: filter up to c, then roll on by the actions that were taken."""
+    hidden, state = model.initial(1)
+    found = []
+    for t, frame in enumerate(observation):
+        hidden = model.gru(model.transition(torch.cat((state, action[t : t + 1]), -1)), hidden)
+        target = model.likelihood.target(frame[None])
+        seen = model.posterior_context(torch.cat((hidden, model.encoder(target)), -1))
+        unseen = model.prior_context(hidden)
+        state, _ = model.posterior.rsample(seen) if t < context else model.prior.rsample(unseen)
+        logits = model.decoder(torch.cat((hidden, state), -1))
+        found.append(torch.distributions.Bernoulli(logits=logits).log_prob(target).sum())
+    return torch.stack(found[context:])
+
+
+def test_an_open_loop_follows_the_actions_that_were_taken():
+    model, batch, context = make_model(), make_batch(), 2
+
+    scores = score_split(model, in_batches(batch, 3), make_pass("open-loop", 2, 3, context)).values
+
+    with torch.no_grad():
+        futures = [plain_future(model, o, a, context) for o, a in zip(batch.observation, batch.action, strict=True)]
+    expected = torch.cat((torch.zeros(7, context), torch.stack(futures)), 1) * batch.mask  # (N, T)
+    for metric in ("open_loop", "open_loop_marginal"):  # the same where every future is
+        torch.testing.assert_close(scores[metric], expected)
+
+
 def test_scores_of_frames_are_float64_whatever_the_model_computes_in():
     """A logarithm of a mean over particles cancels: of 1e5 nats float32 loses 0.004."""
     model, batch = make_model(), make_batch()
