@@ -1,5 +1,6 @@
 """What several tests need: one thread, and a few digits that nobody has to read from the disk."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,23 @@ import torch
 
 from forbes.cli import main
 from forbes.data.stroke_file import StrokeArrays, save_strokes
+from forbes.training import configuration
 
 torch.set_num_threads(1)  # a second thread gains nothing on matrices of this size
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_module_is_allowed_yet() -> Iterator[None]:
+    """Let a file's tests begin like a process: a record names the modules that were allowed in it, no others."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(configuration, "_allowed", {})
+        yield
+
+
+@pytest.fixture(autouse=True)
+def no_module_is_allowed_by_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let each of them begin so."""
+    monkeypatch.setattr(configuration, "_allowed", {})
 
 
 @pytest.fixture(scope="session")

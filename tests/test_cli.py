@@ -4,6 +4,7 @@ import importlib.metadata
 import json
 import math
 import resource
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ import yaml
 from forbes import __version__
 from forbes.cli import COMMANDS, main
 from forbes.data.episode_store import EpisodeStore
-from forbes.training import WorldModel, configuration
+from forbes.training import WorldModel
 from forbes.training.run_folder import RunFolder, read_metrics
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -157,10 +158,9 @@ def test_a_configuration_cannot_run_a_foreign_module_unless_allowed(tiny_config,
     assert Path("executed").exists()
 
 
-def test_a_family_of_ones_own_is_compared(tiny_config, in_tmp_path, monkeypatch, capfd):
+def test_a_family_of_ones_own_is_compared(tiny_config, in_tmp_path, capfd):
     """Its trainings are processes of their own, which must know its module too; given again, it trains nothing."""
     Path("mine.py").write_text("from forbes.beliefs import GaussianBelief\nclass MyBelief(GaussianBelief): ...\n")
-    monkeypatch.setattr(configuration, "_allowed", {})  # without those of other tests, which are elsewhere
     flags = ["--model.belief", "mine.MyBelief", "--trainer.max_epochs", "1"]
     command = ["--allow-module", "mine", "compare", str(tiny_config), "--scores", "elbo", "-o", "runs", "--", *flags]
 
@@ -170,6 +170,11 @@ def test_a_family_of_ones_own_is_compared(tiny_config, in_tmp_path, monkeypatch,
         assert "MyBelief" in json.dumps(yaml.safe_load(Path("runs/forbes-0/config.yaml").read_text()))
         assert "comparison.csv" in out
     assert "epoch 1/1" not in out
+    start, *_ = json.loads(Path("runs/forbes-0/provenance.json").read_text())
+    assert start["command"].startswith("forbes --allow-module mine fit --config ")
+    recorded = shlex.split(json.loads(Path("runs/comparison.json").read_text())["command"])
+    assert recorded == ["forbes", *command]
+    assert main(recorded[1:]) == 0  # what is recorded can be run
 
 
 def test_a_run_folder_is_named_after_its_configuration_and_holds_all_of_the_run(tiny_config, in_tmp_path, capsys):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from forbes.errors import ForbesError
+from forbes.named import Named
 from forbes.seeding import generator
 
 __all__ = ["SequenceBatch", "SequenceSource", "Split"]
@@ -32,7 +33,7 @@ class SequenceBatch(NamedTuple):
     """True where the process has ended at that step, by itself and not by a time limit, bool (B, T)."""
 
 
-class SequenceSource(ABC):
+class SequenceSource(Named, ABC):
     """A set of sequences. To add one, copy `strokes.py`: four methods and two numbers.
 
     `gather` runs on the CPU and returns the most compact tensors that determine the batch (a NamedTuple of tensors);

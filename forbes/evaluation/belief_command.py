@@ -1,6 +1,5 @@
 """`forbes beliefs`: how far learned beliefs of a known process are from its exact one."""
 
-import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +10,7 @@ import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from torch import Tensor
 
 from forbes.arguments import ArgumentParser, positive
 from forbes.data import SequenceBatch, SequenceDataModule, Split
@@ -27,7 +27,7 @@ from forbes.seeding import derive_seed, generator
 from forbes.training import KnownBelief
 from forbes.training.known_model import has_transition_density
 from forbes.training.loading import load_known_belief
-from forbes.training.provenance import commit
+from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
@@ -47,6 +47,9 @@ Per step, mean and standard error over sequences:
   mode_mass_error   half the sum over modes of |q - exact|, where the process can have several
   elbo_gap          (log p(o_1..T) - ELBO) / T in nats, where the process has all densities; a smaller gap is not a
                     better belief
+
+A KL is infinite where one belief has mass and the other has none, as an exact belief of bounded support; such a column
+gives the share of sequences in which it is, instead of a mean, and the record has it as "infinite".
 
 Below the runs stands the diagonal Gaussian of the exact belief's mean and variance: by the forward KL, the best of its
 family. Where the exact belief is a grid, sums over its cells, elsewhere S samples of both. Writes evaluation.json, and
@@ -73,7 +76,7 @@ def main(argv: Sequence[str]) -> None:
         began = time.monotonic()
         scores = _learned(run, args)
         origin = {
-            "command": shlex.join(["forbes", "beliefs", *argv]),
+            "command": command_line("beliefs", *argv),
             "commit": commit(),
             "seed": args.seed,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -82,7 +85,7 @@ def main(argv: Sequence[str]) -> None:
             "seconds": round(time.monotonic() - began, 1),
         }
         names = {metric: _metric_name(run, args, metric) for metric in scores.values}
-        entries = {name: describe(scores, metric) | origin for metric, name in names.items()}
+        entries = {name: _describe(scores, metric) | origin for metric, name in names.items()}
         write_record(run.path, entries, {name: scores.values[metric].sum(1) for metric, name in names.items()})
         table.add_row(*_row(run.path, f"{type(run.module.model.head).__name__}, {run.module.objective}", scores))
     table.add_row(*_row("", "moment-matched Gaussian", _matched(runs[0], args)))
@@ -157,7 +160,9 @@ def _learned(run: _Run, args: Any) -> Scores:
         return errors
 
     scores = _score(run, args, "learned", compare)
-    require_finite(run.path, 0, scores.values)
+    require_finite(
+        run.path, 0, {name: values.where(values != torch.inf, 0.0) for name, values in scores.values.items()}
+    )
     return scores
 
 
@@ -192,6 +197,28 @@ def _row(name: str, belief: str, scores: Scores) -> list[str]:
     cells = []
     for metric in (*ERRORS, "elbo_gap"):
         values = scores.values.get(metric)
-        each = None if values is None else Estimate.per_step(values.sum(1), scores.steps)
-        cells.append("" if each is None else f"{each.mean:.3f} ± {each.standard_error:.3f}")
+        cells.append("" if values is None else _cell(values.sum(1), scores.steps))
     return [escape(name), belief, *cells]
+
+
+def _cell(totals: Tensor, steps: Tensor) -> str:
+    """Write the mean over all steps, or the share of sequences in which it is infinite."""
+    if share := _share_infinite(totals):
+        return f"inf in {share:.1%}"
+    each = Estimate.per_step(totals, steps)
+    return f"{each.mean:.3f} ± {each.standard_error:.3f}"
+
+
+def _describe(scores: Scores, metric: str) -> dict[str, Any]:
+    """Return the entry of `evaluation.json`, where JSON has no infinity: the mean is null where it is infinite."""
+    share = _share_infinite(scores.total(metric))
+    if share == 0:
+        return describe(scores, metric) | {"infinite": share}
+    unknown = {"mean": None, "standard_error": None}
+    counts = {"sequences": len(scores.mask), "steps": int(scores.steps.sum())}
+    return {**unknown, "per_step": unknown, **counts, "infinite": share}
+
+
+def _share_infinite(totals: Tensor) -> float:
+    """Return the share of sequences with an infinite score, `(N,)`."""
+    return totals.isinf().double().mean().item()

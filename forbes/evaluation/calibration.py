@@ -4,8 +4,8 @@ A belief is calibrated where the true value is to its samples as one more of the
 that is then uniform on 0 … L, whatever the belief (`forbes.evaluation.uniformity` tests that): of the value in each
 dimension (simulation-based calibration, Talts et al., 2018), of its density (expected coverage of the highest-density
 regions, Hermans et al., 2022), of its distance from a random point (TARP, Lemos et al., 2023). Pairs must be
-independent: of a sequence take one step. The classifier two-sample test (Lopez-Paz and Oquab, 2017) compares samples
-with samples.
+independent: of a sequence take one step. The classifier two-sample test (Lopez-Paz and Oquab, 2017) gives no rank: it
+tells true values from samples.
 """
 
 import math
@@ -53,11 +53,7 @@ def tarp_ranks(truth: Tensor, samples: Tensor, generator: torch.Generator) -> Te
     Returns:
         Ranks from 0 to L, `(N,)`, int64; f of the paper is rank / L.
     """
-    _require_pairs("tarp_ranks", truth, samples)
-    if len(samples) < 2 or len(truth) < 2:
-        raise ForbesError(
-            f"tarp_ranks: {len(truth)} pairs with {len(samples)} samples, expected at least 2 of each. Draw more"
-        )
+    _require_values("tarp_ranks", truth, samples, pairs=2)
     reference = samples[0].roll(1, 0)  # (N, D)
     scale = _scale(samples[0])  # (D,)
     distances = [((values - reference) / scale).square().sum(-1) for values in (truth, samples[1:])]  # (N,), (L, N)
@@ -85,58 +81,56 @@ def coverage(density_ranks: Tensor, samples: int, levels: Tensor) -> Tensor:
 
 
 class TwoSampleTest(NamedTuple):
-    """How well a classifier tells two sets of samples apart."""
+    """How well a classifier tells true values from samples of the beliefs about them."""
 
     accuracy: float
-    """On samples it was not fitted to; 0.5 where they have one distribution."""
+    """On pairs it was not fitted to; its expectation is 0.5 for a calibrated belief."""
     p_value: float
-    """Share of random labellings that are told apart as well."""
+    """Share of random exchanges within the pairs that are told apart as well."""
 
 
 def two_sample_test(
-    first: Tensor, second: Tensor, generator: torch.Generator, folds: int = 5, permutations: int = 199
+    truth: Tensor, samples: Tensor, generator: torch.Generator, folds: int = 5, permutations: int = 199
 ) -> TwoSampleTest:
-    """Tell two sets of samples apart by the majority among nearest neighbours (C2ST).
+    """Tell the true value from the first sample of its belief, given the mean m of the others (C2ST).
 
-    A sample of one fold is given the label of most of its k nearest neighbours in the other folds, k near the root of
-    their number. Nothing is trained, so labels can be permuted at no cost, and the p-value is exact at any size. It
-    sees missing modes at once, a wrong width worse than the ranks do.
+    What is classified is (s - m, m). Each value gets the label of most of its k nearest neighbours in the other folds,
+    k near the root of their number. The two values of a pair share m, so they are never independent, and a pair is
+    never split: folds are of pairs, and a permutation exchanges the two labels within each of a random half of the
+    pairs. For a calibrated belief such an exchange changes no distribution, hence the p-value is valid at any N.
 
     Args:
-        first: `(N, D)`.
-        second: `(M, D)`; like N, so that 0.5 is what chance gives.
-        generator: of the folds and the permutations.
-        folds: as many parts take their turn.
-        permutations: of the labels.
+        truth: `(N, D)`.
+        samples: `(L + 1, N, D)`.
+        generator: for the folds and the permutations.
+        folds: number of parts.
+        permutations: number of random exchanges.
     """
-    fit = first.shape[1:] == second.shape[1:] and len(first) + len(second) >= 4 * folds
-    if not (fit and first.isfinite().all() and second.isfinite().all()):
-        raise ForbesError(
-            f"two_sample_test: {tuple(first.shape)} and {tuple(second.shape)}, expected two sets of finite samples, "
-            f"(N, D) and (M, D), {4 * folds} together. Look at how they were drawn"
-        )
-    values = torch.cat((first, second)).double()  # (N + M, D)
-    values = values / _scale(values)
-    order = torch.randperm(len(values), generator=generator)
-    neighbours = torch.empty(len(values), _neighbours(len(values), folds), dtype=torch.long)  # (N + M, K)
+    _require_values("two_sample_test", truth, samples, pairs=2 * folds)
+    count, centre = len(truth), samples[1:].mean(0)  # N, (N, D)
+    values = torch.stack([torch.cat((one - centre, centre), -1) for one in (truth, samples[0])])  # (2, N, 2 D)
+    values = values / _scale(values.flatten(0, 1))
+    neighbours = torch.empty(2, count, _neighbours(count, folds), dtype=torch.long)  # (2, N, K), of 2 N in a row
+    order = torch.randperm(count, generator=generator)
     for fold in order.chunk(folds):
-        others = order[~torch.isin(order, fold)]
-        nearest = torch.cdist(values[fold], values[others]).topk(neighbours.shape[1], largest=False).indices
-        neighbours[fold] = others[nearest]  # (F, K)
-    label = torch.arange(len(values)) >= len(first)  # (N + M,)
+        others = order[~torch.isin(order, fold)]  # (N - F,)
+        others = torch.cat((others, others + count))  # (2 (N - F),)
+        distance = torch.cdist(values[:, fold], values.flatten(0, 1)[others])  # (2, F, 2 (N - F))
+        neighbours[:, fold] = others[distance.topk(neighbours.shape[-1], largest=False).indices]
+    label = torch.tensor([[False], [True]]).expand(2, count)  # (2, N), True for a sample
     accuracy = _accuracy(label, neighbours)
-    drawn = [_accuracy(label[torch.randperm(len(label), generator=generator)], neighbours) for _ in range(permutations)]
-    as_good = sum(other >= accuracy for other in drawn)
+    exchanges = torch.rand(permutations, count, generator=generator) < 0.5  # (P, N)
+    as_good = sum(_accuracy(label ^ exchange, neighbours) >= accuracy for exchange in exchanges)
     return TwoSampleTest(accuracy, (1 + as_good) / (1 + permutations))
 
 
-def _neighbours(count: int, folds: int) -> int:
-    """Give the odd number, at most the root of the number of samples in the other folds: no vote is a tie."""
-    return (math.isqrt(count - math.ceil(count / folds)) - 1) // 2 * 2 + 1
+def _neighbours(pairs: int, folds: int) -> int:
+    """Return the odd number, at most the root of the number of values in the other folds: no vote is a tie."""
+    return (math.isqrt(2 * (pairs - math.ceil(pairs / folds))) - 1) // 2 * 2 + 1
 
 
 def _accuracy(label: Tensor, neighbours: Tensor) -> float:
-    votes = label[neighbours].double().mean(1)  # (N + M,)
+    votes = label.flatten()[neighbours].double().mean(-1)  # (2, N)
     return ((votes > 0.5) == label).double().mean().item()
 
 
@@ -154,3 +148,14 @@ def _require_pairs(where: str, truth: Tensor, samples: Tensor) -> None:
         )
     if truth.isnan().any() or samples.isnan().any():
         raise ForbesError(f"{where}: there are NaN, expected numbers. Look for the step at which the belief diverged")
+
+
+def _require_values(where: str, truth: Tensor, samples: Tensor, pairs: int) -> None:
+    """Require what distances are made of: finite values, one sample more than is compared, and enough pairs."""
+    _require_pairs(where, truth, samples)
+    if len(samples) < 2 or len(truth) < pairs:
+        raise ForbesError(
+            f"{where}: {len(truth)} pairs with {len(samples)} samples, expected at least {pairs} and 2. Draw more"
+        )
+    if truth.isinf().any() or samples.isinf().any():
+        raise ForbesError(f"{where}: there are infinite values, expected finite ones. Look at how they were drawn")

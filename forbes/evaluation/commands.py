@@ -2,7 +2,6 @@
 
 import argparse
 import itertools
-import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -32,7 +31,7 @@ from forbes.evaluation.runs import (
 )
 from forbes.evaluation.scoring import PASSES, Parts, Pass, exact_pass, make_pass, score_split
 from forbes.evaluation.tables import print_degradation, print_pairs, print_references, print_runs
-from forbes.training.provenance import commit
+from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["add_score_options", "evaluate", "main", "wanted_metrics"]
@@ -94,7 +93,7 @@ class _Job(NamedTuple):
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = _parser().parse_args(argv)
-    command = shlex.join(["forbes", "evaluate", *argv])
+    command = command_line("evaluate", *argv)
     if is_agent(args.runs[0]):
         return evaluate_agents(
             args.runs, args.episodes, args.acting_samples, args.seed, find_device(args.device), command

@@ -1,7 +1,6 @@
 """Trained runs that are looked at together: what each is, and whether their numbers may be compared."""
 
 import hashlib
-import inspect
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -123,10 +122,8 @@ def split_batches(
 
 
 def data_name(data: SequenceDataModule) -> str:
-    """Say what data these are: the source with its arguments, and the length."""
-    values = {name: getattr(data.source, name) for name in inspect.signature(type(data.source)).parameters}
-    listed = ", ".join(f"{name}={value}" for name, value in values.items() if value is not None)
-    return f"{type(data.source).__name__}({listed}), {data.length} steps"
+    """Name the data: the source with its arguments, and the length."""
+    return f"{data.source}, {data.length} steps"
 
 
 def data_sha256(data: SequenceDataModule, split: Split, sequences: int) -> str:

@@ -32,7 +32,7 @@ class SelfCalibration(NamedTuple):
     tarp: Tensor
     """Of the distance from a random point, `(N,)`."""
     classifier: TwoSampleTest
-    """Tells (s, m) from (s', m): drawn state, one sample of its belief, and beside both the mean m of the others."""
+    """Tells the drawn state from one sample of its belief, given the mean of the others."""
 
 
 @torch.no_grad()
@@ -60,10 +60,9 @@ def self_calibration(model: StateSpaceModel, action: Tensor, samples: int, seed:
             of_draws.add(model.posterior.log_prob(draws[1:], context).double())
     draw = generator(seed, "ties", 0)
     truth, draws = truth.double().cpu(), draws.double().cpu()
-    drawn, held = (torch.cat((state, draws[1:].mean(0)), -1) for state in (truth, draws[0]))  # 2 x (N, 2 D)
     return SelfCalibration(
         value=ranks(truth, draws[1:], draw),
         density=ranks(of_truth.result().cpu(), of_draws.result().cpu(), draw),
         tarp=tarp_ranks(truth, draws, draw),
-        classifier=two_sample_test(drawn, held, generator(seed, "classifier", 0)),
+        classifier=two_sample_test(truth, draws, generator(seed, "classifier", 0)),
     )

@@ -1,7 +1,6 @@
 """`forbes compare`: train several configurations under several seeds, measure them alike, and put them side by side."""
 
 import json
-import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -25,7 +24,7 @@ from forbes.figures.style import save_figure
 from forbes.files import replace_file
 from forbes.training.configuration import allowed_modules
 from forbes.training.jobs import Job, run_jobs
-from forbes.training.provenance import commit
+from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
@@ -49,7 +48,7 @@ def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     cut = argv.index("--") if "--" in argv else len(argv)
     args, flags = _parser().parse_args(argv[:cut]), list(argv[cut + 1 :])
-    command = shlex.join(["forbes", "compare", *argv])
+    command = command_line("compare", *argv)
     folders = _run_folders(args.configs, args.seeds, args.output)
     _train(
         [

@@ -1,7 +1,6 @@
 """`forbes completions`: whether predictions of digits are precise yet diverse, in numbers and in pictures."""
 
 import json
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -18,7 +17,7 @@ from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs
 from forbes.figures.completions import by_ambiguity, drawings, errors, scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
-from forbes.training.provenance import commit
+from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
@@ -63,7 +62,7 @@ def main(argv: Sequence[str]) -> None:
         studies.append(study(named, judges, beginnings, args.split, args.samples, args.seed))
         print_study(studies[-1], data.length)
     record = {
-        "command": shlex.join(["forbes", "completions", *argv]),
+        "command": command_line("completions", *argv),
         "commit": commit(),
         "seed": args.seed,
         "data": {"name": data_name(data), "sha256": hashes[0]},

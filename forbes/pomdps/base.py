@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from forbes.errors import ForbesError
+from forbes.named import Named
 from forbes.pomdps.beliefs import ExactBelief, GaussianMixtureBelief
 from forbes.pomdps.distributions import Distribution
 
@@ -64,7 +65,7 @@ class AffineGaussian(NamedTuple):
         return GaussianMixtureBelief(mean.new_zeros(*mean.shape[:-1], 1), mean.unsqueeze(-2), self.covariance[time])
 
 
-class Process(ABC):
+class Process(Named, ABC):
     """A partially observable process whose belief is known exactly.
 
     To add one, copy the file that is most like it: `linear_gaussian.py` (Kalman), `mirror_sensor.py` (grid) or

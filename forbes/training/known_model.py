@@ -98,7 +98,7 @@ class KnownBelief(LightningModule):
             raise _not_its_data(self.process, f"those of {type(source).__name__}")
         ours, theirs = (process.sample(2, 10, generator(0, "same", 0)) for process in (self.process, source.process))
         if not all(map(torch.equal, ours, theirs)):
-            raise _not_its_data(self.process, f"those of {type(source.process).__name__} with numbers of its own")
+            raise _not_its_data(self.process, f"those of {source.process}")
 
     def state_nll(self, batch: SequenceBatch) -> Tensor:
         """Give -log q(s_t | o_1:t) of the true states in nats, `(B, T)`."""
@@ -178,6 +178,6 @@ def _require_density(process: Process, objective: Objective) -> None:
 
 def _not_its_data(process: Process, found: str) -> ForbesError:
     return ForbesError(
-        f"KnownBelief: the data are {found}, expected those of its {type(process).__name__}. Give model and data the "
+        f"KnownBelief: the data are {found}, expected those of its {process}. Give model and data the "
         "same process, as configs/pomdp does"
     )

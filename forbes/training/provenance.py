@@ -21,10 +21,11 @@ from lightning.pytorch.cli import LightningArgumentParser, SaveConfigCallback
 import forbes
 from forbes.errors import ForbesError
 from forbes.files import replace_file
+from forbes.training.configuration import allowed_modules
 from forbes.training.run_folder import RunFolder
 from forbes.training.stop import StopOnSignal
 
-__all__ = ["RecordRun", "commit"]
+__all__ = ["RecordRun", "command_line", "commit"]
 
 PACKAGES = ("torch", "lightning", "jsonargparse", "numpy", "dm-control", "mujoco", "gymnasium")
 """What may change the numbers of a run; the last three are optional."""
@@ -88,7 +89,7 @@ class RecordRun(SaveConfigCallback):
 def _describe(arguments: Sequence[str]) -> dict[str, Any]:
     """Give what does not depend on the configuration."""
     return {
-        "command": shlex.join(["forbes", *arguments]),
+        "command": command_line(*arguments),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": commit(),
         "versions": _versions(),
@@ -113,6 +114,11 @@ def _versions() -> dict[str, str]:
 def _describe_data(trainer: Trainer) -> dict[str, Any]:
     """Give the hash of the data."""
     return {"data_sha256": trainer.datamodule.source.sha256()}  # type: ignore[attr-defined]
+
+
+def command_line(*arguments: str) -> str:
+    """Return the command line to repeat a command, with the modules that this process was allowed to use."""
+    return shlex.join(["forbes", *allowed_modules(), *arguments])
 
 
 def commit() -> str | None:

@@ -128,6 +128,23 @@ def test_many_trajectories_take_the_discrete_action_that_most_of_them_choose():
         np.testing.assert_array_equal(action, counts == counts.max())
 
 
+@pytest.mark.parametrize("trajectories", [1, 3])
+def test_every_candidate_plan_is_tried_on_a_draw_of_its_own(trajectories):
+    """20 candidates take turns on the trajectories, each from (h, s) with another s of that trajectory's belief."""
+    model, _ = build()
+    seen = torch.from_numpy(OBSERVATIONS)[None].expand(trajectories, -1, -1)  # (K, T, 3)
+    filtered = model.filter(model.embed(seen), torch.zeros(trajectories, 6, 2))
+    last = type(filtered)(*(values[:, -1:] for values in filtered))  # (K, 1, ...)
+    roll, starts = model.roll, []
+    model.roll = lambda start, *others: [starts.append(start), roll(start, *others)][1]
+
+    follow_plan(model, lambda features: features.sum(-1), search())(last)
+
+    start = starts[0]
+    assert start.state.flatten().unique().numel() == start.state.numel() == 20 * 4
+    assert torch.equal(start.hidden, last.hidden[:, 0].repeat(20, 1)[:20])
+
+
 def test_a_plan_may_spread_its_candidates_over_trajectories():
     """20 candidates on 3 trajectories, which share their actions but not their states."""
     model, actor = build()

@@ -44,7 +44,7 @@ def test_the_return_is_what_the_agent_earns_without_exploration(run, capsys):
     assert entry["standard_error"] == pytest.approx(np.std(earned, ddof=1) / np.sqrt(3), rel=1e-5)
     np.testing.assert_array_equal(read_arrays(str(run))[NAME], entry["returns"])
     assert entry["environment"]["task"] == "Parrot"
-    assert entry["command"].startswith("forbes evaluate")
+    assert entry["command"].startswith("forbes --allow-module toy_environments evaluate")
     assert "ImaginationActorCritic" in capsys.readouterr().out
 
 

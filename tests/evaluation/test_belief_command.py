@@ -134,7 +134,10 @@ def test_what_cannot_be_measured_is_one_sentence(run, tiny_run, tmp_path, capsys
         (["beliefs", run], f"--sequences 200: the test split of {run} has 12, expected 2 to that"),
         (["beliefs", run, "--sequences", "1"], "--sequences 1: "),
         (["beliefs", run, other, *few], f"{other}: its data are Simulated("),
-        (["beliefs", mixed, *few], "the data are those of MountainHike with numbers of its own"),
+        (
+            ["beliefs", mixed, *few],
+            "those of MountainHike(start=multi, observation_std=1.5), expected those of its MountainHike(start=multi, ",
+        ),
         (["beliefs", tmp_path / "absent"], "absent: no such run folder"),
     ]:
         assert sentence in error_of(capsys, *arguments)
@@ -149,6 +152,30 @@ def test_a_belief_that_is_not_finite_is_named(run, capsys):
     sentence = error_of(capsys, "beliefs", run, "--sequences", "12")
 
     assert f"{run}: the state_nll_regret of sequence 0 is nan" in sentence
+
+
+def test_an_infinite_reverse_kl_is_reported_as_a_share_of_sequences(tmp_path, capsys):
+    """A Gaussian reaches beyond an exact belief of bounded support: infinite is the answer, not a diverged training."""
+    allow = ["--allow-module", "bounded_process"]
+    run = fit(tmp_path, "{class_path: bounded_process.Box}", *allow)
+    capsys.readouterr()
+
+    assert beliefs(run, "--sequences", "12", *allow) == 0
+
+    entries, out = record(run), capsys.readouterr().out
+    with np.load(run / "evaluation.npz") as arrays:
+        infinite = np.isinf(arrays["test/reverse_kl[S=5]"]).mean()
+        assert all(np.isfinite(arrays[f"test/{metric}[S=5]"]).all() for metric in ("forward_kl", "variance_ratio"))
+    assert infinite > 0
+    reverse, forward = (entries[f"test/{metric}[S=5]"] for metric in ("reverse_kl", "forward_kl"))
+    assert (reverse["mean"], reverse["per_step"]["mean"], reverse["infinite"]) == (None, None, infinite)
+    assert forward["infinite"] == 0
+    assert f"inf in {infinite:.1%}" in out
+    matched = next(line for line in out.splitlines() if "moment-matched" in line)
+    forward_kl, reverse_kl, regret, ratio = (cell.strip() for cell in matched.split("│")[3:7])
+    assert reverse_kl.startswith("inf in ")
+    assert all("±" in cell for cell in (forward_kl, regret, ratio))
+    assert "nan" not in out
 
 
 def test_a_flow_learns_two_modes_where_the_best_gaussian_cannot(tmp_path, capsys):

@@ -9,7 +9,7 @@ from torch import nn
 from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.evaluation.bounds import trajectories
+from forbes.evaluation.bounds import frame_log_prob, score_predictions, trajectories
 from forbes.evaluation.scoring import make_pass, score_split
 from forbes.evaluation.smc import score_particles
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, Normal, ParticleModel, StateSpaceModel
@@ -108,6 +108,44 @@ def test_equals_a_plain_loop_over_sequences_and_steps(likelihood, batch_size, mo
     torch.testing.assert_close(scores["reconstruction"] - scores["kl"], scores["elbo"])
 
 
+def plain_future(model, observation, action, context):
+    """log p of each later frame of one sequence: filter up to c, then roll on by the actions that were taken."""
+    hidden, state = model.initial(1)
+    found = []
+    for t, frame in enumerate(observation):
+        hidden = model.gru(model.transition(torch.cat((state, action[t : t + 1]), -1)), hidden)
+        target = model.likelihood.target(frame[None])
+        seen = model.posterior_context(torch.cat((hidden, model.encoder(target)), -1))
+        unseen = model.prior_context(hidden)
+        state, _ = model.posterior.rsample(seen) if t < context else model.prior.rsample(unseen)
+        logits = model.decoder(torch.cat((hidden, state), -1))
+        found.append(torch.distributions.Bernoulli(logits=logits).log_prob(target).sum())
+    return torch.stack(found[context:])
+
+
+def test_an_open_loop_follows_the_actions_that_were_taken():
+    model, batch, context = make_model(), make_batch(), 2
+
+    scores = score_split(model, in_batches(batch, 3), make_pass("open-loop", 2, 3, context)).values
+
+    with torch.no_grad():
+        futures = [plain_future(model, o, a, context) for o, a in zip(batch.observation, batch.action, strict=True)]
+    expected = torch.cat((torch.zeros(7, context), torch.stack(futures)), 1) * batch.mask  # (N, T)
+    for metric in ("open_loop", "open_loop_marginal"):  # the same where every future is
+        torch.testing.assert_close(scores[metric], expected)
+
+
+def test_scores_of_frames_are_float64_whatever_the_model_computes_in():
+    """A logarithm of a mean over particles cancels: of 1e5 nats float32 loses 0.004."""
+    model, batch = make_model(), make_batch()
+    model.log_likelihood = lambda features, target: torch.full(features.shape[:-1], -1e5, dtype=torch.float32)
+
+    found = frame_log_prob(model, torch.zeros(3, STEPS, 7), batch.observation[0])
+
+    assert found.dtype == torch.float64
+    assert found.shape == (3, STEPS)
+
+
 @pytest.mark.parametrize("belief", [GaussianBelief, FlowBelief])
 def test_its_samples_are_estimates_of_the_bound_that_is_trained(belief):
     model, batch = make_model(belief), make_batch()
@@ -151,6 +189,22 @@ def test_the_fivo_bound_is_the_one_that_particles_are_trained_by():
 
     torch.testing.assert_close(scores["fivo"].sum(1), terms.elbo)
     assert (scores["ess"][batch.mask] < 0.5).any()
+
+
+def test_a_prediction_of_weighted_particles_is_their_weighted_mean():
+    model, batch = make_model(GaussianBelief, build=partial(ParticleModel, particles=5)), make_batch()
+    torch.manual_seed(3)
+    scores = score_predictions(model, batch, 10)  # two sets
+
+    torch.manual_seed(3)
+    seen = model.see(batch.observation, batch.action)
+    likelihood = 0
+    with torch.no_grad():
+        for features, log_weight in (model.predictions(seen) for _ in range(2)):
+            log_prob = torch.stack([model.log_likelihood(some, seen.target) for some in features])  # (K, B, T)
+            likelihood += (log_weight.exp() * log_prob.exp()).sum(0) / 2
+    torch.testing.assert_close(scores["pll"], likelihood.log() * batch.mask)
+    assert (log_weight.std(0)[:, 1:] > 0.01).any()
 
 
 def test_the_reported_value_is_the_mean_over_samples_and_depends_on_the_seed_alone():

@@ -152,22 +152,57 @@ def test_tarp_sees_a_correlation_that_the_ranks_of_each_dimension_cannot():
     assert known > LEVEL
 
 
-def test_one_distribution_is_told_apart_in_five_cases_of_a_hundred():
-    repeats = 200
+def held(count, width, seed):
+    """True values about whose mean a belief N(mean, width²) is held, two-dimensional, and 40 samples of it."""
+    draw = generator(seed)
+    mean, truth, samples = (
+        torch.randn(*shape, count, 2, generator=draw, dtype=torch.float64) for shape in [(), (), (40,)]
+    )
+    return mean + truth, mean + width * samples, draw
 
-    tests = [two_sample_test(normal(40, 2, seed=2 * i), normal(40, 2, seed=2 * i + 1), generator(i), permutations=99)
-             for i in range(repeats)]  # fmt: skip
 
-    false_alarms = sum(test.p_value <= LEVEL for test in tests) / repeats
-    assert abs(false_alarms - LEVEL) < 4 * math.sqrt(LEVEL * (1 - LEVEL) / repeats)
-    accuracy = torch.tensor([test.accuracy for test in tests])
-    assert abs(accuracy.mean() - 0.5) < 4 * accuracy.std() / math.sqrt(repeats) + 1 / 80  # a left-out label is rarer
+def two_sample_tests(count, width, repeats, permutations=99):
+    """P-values and accuracies, `(repeats,)`."""
+    tests = [two_sample_test(*held(count, width, seed), permutations=permutations) for seed in range(repeats)]
+    return torch.tensor([test.p_value for test in tests]), torch.tensor([test.accuracy for test in tests])
+
+
+def test_true_values_of_exact_beliefs_are_told_apart_at_the_level():
+    repeats = 400
+
+    p_value, accuracy = two_sample_tests(count=100, width=1.0, repeats=repeats)
+
+    assert abs(accuracy.mean() - 0.5) < 4 * accuracy.std() / math.sqrt(repeats)
+    # The accuracy is a number of 200 answers, its deviation 8 of them; exchanges that are as good count as better.
+    for level, tied in ((LEVEL, 0.01), (0.5, 0.05)):
+        noise = 3 * math.sqrt(level * (1 - level) / repeats)
+        assert -noise - tied < (p_value <= level + 1e-9).double().mean() - level < noise
+
+
+def test_beliefs_that_are_too_narrow_are_told_apart():
+    twenty_percent, _ = two_sample_tests(count=1000, width=0.8, repeats=20, permutations=39)
+    thirty_percent, accuracy = two_sample_tests(count=1000, width=0.7, repeats=10, permutations=39)
+
+    assert (twenty_percent <= LEVEL).double().mean() >= 0.8  # of 200 cases 98 in 100
+    assert (thirty_percent <= LEVEL).all()
+    assert accuracy.min() > 0.55
+
+
+def test_two_values_of_one_pair_never_judge_each_other():
+    """Beliefs whose means lie far apart: a value's nearest neighbour by far is its twin, of the other label."""
+    mean = 100 * torch.arange(40, dtype=torch.float64)[:, None]
+    samples = mean + normal(40, 40, 1)
+
+    accuracy, p_value = two_sample_test(mean + normal(40, 1, seed=1), samples, generator())
+
+    assert abs(accuracy - 0.5) < 4 / math.sqrt(4 * 80)
+    assert p_value > 0.01
 
 
 def test_accuracy_of_two_gaussians_is_nearly_that_of_the_best_classifier():
-    first, second = normal(1000, 1), normal(1000, 1, seed=1) + 2
+    samples = torch.cat((normal(1, 1000, 1, seed=1) + 2, torch.zeros(1, 1000, 1)))  # nothing is known beside the values
 
-    accuracy, p_value = two_sample_test(first, second, generator(), permutations=99)
+    accuracy, p_value = two_sample_test(normal(1000, 1), samples, generator(), permutations=99)
 
     best = torch.special.ndtr(torch.tensor(1.0)).item()  # the border lies at 1
     assert best - 0.02 < accuracy < best + 4 * math.sqrt(best * (1 - best) / 2000)
@@ -176,12 +211,12 @@ def test_accuracy_of_two_gaussians_is_nearly_that_of_the_best_classifier():
 
 def test_a_missing_mode_is_told_apart_and_a_constant_dimension_does_no_harm():
     sign = torch.where(normal(400, 1) > 0, 1.0, -1.0)
-    first = torch.cat((3 * sign + normal(400, 1, seed=1), torch.ones(400, 1)), 1)
-    second = torch.cat((3 + normal(400, 1, seed=2), torch.ones(400, 1)), 1)
+    truth = torch.cat((3 * sign + normal(400, 1, seed=1), torch.ones(400, 1)), 1)
+    sample = torch.cat((3 + normal(400, 1, seed=2), torch.ones(400, 1)), 1)
 
-    accuracy, p_value = two_sample_test(first, second, generator(), permutations=99)
+    accuracy, p_value = two_sample_test(truth, torch.stack((sample, 0 * sample)), generator(), permutations=99)
 
-    assert accuracy == pytest.approx(0.75, abs=4 * math.sqrt(0.75 * 0.25 / 800))  # half of the first are alone
+    assert accuracy == pytest.approx(0.75, abs=4 * math.sqrt(0.75 * 0.25 / 800))  # half of the truths are alone
     assert p_value == 0.01
 
 
@@ -193,9 +228,11 @@ def test_a_missing_mode_is_told_apart_and_a_constant_dimension_does_no_harm():
         (lambda g: tarp_ranks(normal(3, 2), normal(9, 3, 1), g), r"^tarp_ranks: \(9, 3, 1\) samples for \(3, 2\)"),
         (lambda g: tarp_ranks(normal(3, 2), normal(1, 3, 2), g), "^tarp_ranks: 3 pairs with 1 samples"),
         (lambda g: tarp_ranks(normal(1, 2), normal(9, 1, 2), g), "^tarp_ranks: 1 pairs with 9 samples"),
-        (lambda g: two_sample_test(normal(30, 2), normal(30, 3), g), r"^two_sample_test: \(30, 2\) and \(30, 3\)"),
-        (lambda g: two_sample_test(normal(9, 2), normal(9, 2), g), r"^two_sample_test: \(9, 2\) and \(9, 2\)"),
-        (lambda g: two_sample_test(normal(30, 2), normal(30, 2).log(), g), "expected two sets of finite samples"),
+        (lambda g: tarp_ranks(normal(3, 2) / 0, normal(9, 3, 2), g), "^tarp_ranks: there are infinite values"),
+        (lambda g: two_sample_test(normal(30, 2), normal(9, 30, 3), g), r"^two_sample_test: \(9, 30, 3\) samples for"),
+        (lambda g: two_sample_test(normal(9, 2), normal(9, 9, 2), g), "^two_sample_test: 9 pairs with 9 samples"),
+        (lambda g: two_sample_test(normal(30, 2), normal(1, 30, 2), g), "^two_sample_test: 30 pairs with 1 samples"),
+        (lambda g: two_sample_test(normal(30, 2), normal(9, 30, 2).log(), g), "^two_sample_test: there are NaN"),
     ],
 )
 def test_what_cannot_be_checked_is_one_sentence(call, expected):

@@ -127,7 +127,7 @@ def test_evaluate_says_it_of_a_known_process_and_of_nothing_else(tmp_path, capsy
     key = "reward_uncertainty[episodes=2]"
     record = read_record(str(tmp_path / "hike"))
     assert record[key]["mean"] > 0
-    assert record[key]["command"].startswith("forbes evaluate")
+    assert record[key]["command"].startswith("forbes --allow-module toy_environments evaluate")
     assert key not in read_record(str(tmp_path / "blind"))
 
     assert forbes("evaluate", tmp_path / "parrot", "--episodes", 2) == 0

@@ -6,7 +6,7 @@ from torch import nn
 
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.evaluation.scoring import Pass, score_split
+from forbes.evaluation.scoring import Parts, Pass, score_split
 
 STEPS = 3
 
@@ -48,6 +48,27 @@ def test_a_batch_for_which_the_memory_does_not_suffice_is_halved_loudly(limit, e
 def test_a_sequence_that_does_not_fit_alone_is_an_error_with_a_remedy():
     with pytest.raises(ForbesError, match=r"runs/a: no memory for one sequence with K=9. Choose fewer particles"):
         score_split(nn.Linear(1, 1), batches(), hungry(0, OUT_OF_MEMORY[0]), where="runs/a")
+
+
+def noise_of(seed, parts=None):
+    """What a pass of noise alone gives in two batches, (10, T)."""
+    noise = Pass(("noise",), "", lambda model, batch: {"noise": torch.randn(batch.mask.shape).double()}, 5)
+    return score_split(nn.Linear(1, 1), batches(), noise, seed, parts=parts).values["noise"]
+
+
+def test_every_batch_and_every_seed_has_noise_of_its_own():
+    first = noise_of(seed=0)
+
+    assert first.flatten().unique().numel() == 10 * STEPS
+    assert torch.equal(noise_of(seed=0), first)
+    assert not torch.isin(noise_of(seed=1), first).any()
+
+
+def test_a_batch_has_the_same_noise_whatever_was_scored_before(tmp_path):
+    whole, parts = noise_of(seed=0), Parts(tmp_path / "parts", "noise")
+    parts.write(0, {"noise": whole[:5]})  # what an interrupted evaluation has left
+
+    assert torch.equal(noise_of(seed=0, parts=parts), whole)
 
 
 def test_another_error_is_not_taken_for_a_lack_of_memory():

@@ -160,7 +160,10 @@ def test_the_first_sample_is_the_path_the_filter_took_and_all_differ(belief):
 @pytest.mark.parametrize("entropy", [0.0, 0.3])
 @pytest.mark.parametrize("trajectories", [1, 3])
 def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy, trajectories):
-    """The losses, spelled out along each trajectory, which has a beginning and actions of its own."""
+    """The losses, spelled out along each trajectory, which has a beginning and actions of its own.
+
+    The actor learns what each action leads to, not to reach states in which it would choose another: it sees constants.
+    """
     ours, batch = agent(trajectories=trajectories, actor_entropy=entropy), make_batch(1, 2)
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     torch.manual_seed(3)
@@ -170,7 +173,7 @@ def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy, t
     state = State(*(values.flatten(0, 2) for values in belief_samples(ours.model, filtered, trajectories)))
     nats, states = [], []
     for _ in range(4):
-        action, log_prob = ours.actor(torch.cat(state, -1)).rsample()
+        action, log_prob = ours.actor(torch.cat(state, -1).detach()).rsample()
         assert action.unique().numel() == 2 * trajectories
         nats.append(-entropy * log_prob)
         rollout = ours.model.imagine(state, action[:, None])
@@ -184,6 +187,7 @@ def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy, t
 
     acting = (first + nats[0]) + g * (second + nats[1]) + g**2 * (third + nats[2])
     torch.testing.assert_close(actor, -acting.mean() / 3)
+    torch.testing.assert_close(gradients(actor, [ours.actor]), gradients(-acting.mean() / 3, [ours.actor]))
     errors = [(value - target) ** 2 / 2 for value, target in zip(v, (first, second, third), strict=False)]
     torch.testing.assert_close(critic, (errors[0] + g * errors[1] + g**2 * errors[2]).mean() / 3)
 

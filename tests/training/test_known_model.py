@@ -107,7 +107,7 @@ def test_a_process_that_does_not_fit_is_one_sentence(process, options, sentence)
 @pytest.mark.parametrize(
     ("process", "found"),
     [
-        (LinearGaussian(0.9), "those of LinearGaussian with numbers of its own"),
+        (LinearGaussian(0.9), r"those of LinearGaussian\(transition=0\.9, .*"),
         (MirrorSensor(cells=401), "those of MirrorSensor"),
     ],
 )
@@ -115,7 +115,9 @@ def test_data_of_another_process_are_refused(process, found):
     module = KnownBelief(LinearGaussian(), GaussianBelief)
 
     module.require_data(data_of(LinearGaussian()))
-    with pytest.raises(ForbesError, match=rf"the data are {found}.*expected those of its LinearGaussian\."):
+    with pytest.raises(
+        ForbesError, match=rf"the data are {found}.*expected those of its LinearGaussian\(transition=1\.0, "
+    ):
         module.require_data(data_of(process))
 
 
