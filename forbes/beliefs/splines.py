@@ -17,27 +17,46 @@ __all__ = ["SplineCoupling", "knot_table", "spline", "spline_inverse"]
 
 BOUND = 5.0
 """B, half the side of the box: a base of unit scale is beyond it once in two million draws."""
-MIN_SIZE = 1e-3
-"""The smallest width and height of a bin, as a share of the box's side."""
-LOG_SLOPE_BOUND = 3.0
-"""Slopes at the knots stay within e^∓3."""
+MIN_WIDTH = 1e-3
+"""The smallest width of a bin, as a share of the box's side."""
+LOG_MEAN_BOUND = 1.5
+"""Mean slopes of the bins differ by factors below e^3, and stay within e^∓3."""
+LOG_SLOPE_BOUND = 1.0
+"""Slopes at inner knots stay within e^∓1 of the harmonic mean of their two bins'."""
+LOG_SLOPES = -5.5, 4.0
+"""Bounds of the log-slope everywhere, in nats; the lower one is that of a flat bin at the edge, where the slope is 1.
+
+An inverse in float32 loses as many digits as the slope has zeros. With heights that are shares of their own, as in
+Durkan et al., log-slopes reach -16, which is all that float32 has.
+"""
 
 
 def knot_table(raw: Tensor) -> Tensor:
-    r"""Give the bins of splines: shape `(*, 3 K - 1)`, anything, to `(*, 6, K)`.
+    r"""Return the bins of splines: shape `(*, 3 K - 1)`, anything, to `(*, 6, K)`.
 
-    Widths and heights are softmax shares of the box's side, slopes at the K - 1 inner knots
-    :math:`\exp(3 \tanh(u / 3))`, and 1 at both ends. All zeros give the identity.
+    The first K numbers a give the widths, the next K, v, the mean slopes, the last K - 1, u, the slopes at inner knots:
+
+    .. math:: w = 10\,\mathrm{softmax}(a), \quad
+              s_k = \frac{10\,e^{1.5 \tanh(v_k / 1.5)}}{\sum_j w_j\,e^{1.5 \tanh(v_j / 1.5)}}, \quad h = s\,w, \quad
+              d_k = \frac{2\,s_{k-1} s_k}{s_{k-1} + s_k}\,e^{\tanh u_k}
+
+    Widths have a floor of 1e-3 of the side. The slope is 1 at both ends. All zeros give the identity. Unlike heights
+    that are shares of their own (Durkan et al.), these bound the slope inside a bin, too (`LOG_SLOPES`).
 
     Returns:
         Rows: left edge, lower edge, width, height, slope at the left edge and at the right one.
     """
     bins = (raw.shape[-1] + 1) // 3
-    shares = raw[..., : 2 * bins].unflatten(-1, (2, bins)).softmax(-1)  # (*, 2, K)
-    sizes = 2 * BOUND * (MIN_SIZE + (1 - bins * MIN_SIZE) * shares)
+    of_width, of_mean, of_slope = raw.split((bins, bins, bins - 1), -1)
+    width = MIN_WIDTH + (1 - bins * MIN_WIDTH) * of_width.softmax(-1)  # (*, K), shares
+    mean = (LOG_MEAN_BOUND * (of_mean / LOG_MEAN_BOUND).tanh()).exp()  # (*, K)
+    mean = mean / (width * mean).sum(-1, keepdim=True)  # heights, too, add up to the side
+    sizes = 2 * BOUND * torch.stack((width, width * mean), -2)  # (*, 2, K)
     edges = pad(sizes[..., :-1], (1, 0), value=-BOUND).cumsum(-1)  # (*, 2, K)
-    log_slopes = LOG_SLOPE_BOUND * (raw[..., 2 * bins :] / LOG_SLOPE_BOUND).tanh()  # (*, K - 1)
-    slopes = torch.stack((pad(log_slopes, (1, 0)), pad(log_slopes, (0, 1))), -2).exp()  # (*, 2, K)
+    before, after = mean[..., :-1], mean[..., 1:]
+    harmonic = 2 * before * after / (before + after)  # (*, K - 1)
+    slope = harmonic * (LOG_SLOPE_BOUND * (of_slope / LOG_SLOPE_BOUND).tanh()).exp()  # (*, K - 1)
+    slopes = torch.stack((pad(slope, (1, 0), value=1.0), pad(slope, (0, 1), value=1.0)), -2)  # (*, 2, K)
     return torch.cat((edges, sizes, slopes), -2)  # (*, 6, K)
 
 
@@ -126,18 +145,18 @@ class SplineCoupling(Coupling):
         if bins < 2:
             raise ForbesError(f"SplineCoupling: bins is {bins}, expected at least 2; one bin is the identity")
         super().__init__(dim, width, swap)
-        self.knots = nn.Linear(width, self.other * (3 * bins - 1))
-        nn.init.zeros_(self.knots.weight)
-        nn.init.zeros_(self.knots.bias)
+        self.table_of = nn.Linear(width, self.other * (3 * bins - 1))
+        nn.init.zeros_(self.table_of.weight)
+        nn.init.zeros_(self.table_of.bias)
 
     def generator(self, bind: Bind, mixing: LULinear | None = None) -> FlowMap:
         """See `Coupling.generator`; the log-slopes are those of x_b."""
-        return self.network(bind, self.knots.weight, self.knots.bias, _move, mixing, self.given, self.swap)
+        return self.network(bind, self.table_of.weight, self.table_of.bias, _move, mixing, self.given, self.swap)
 
     def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
         """See `Coupling.inverse`."""
-        knots = self.knots.weight, self.knots.bias
-        return self.network(bind_now, *knots, _move_back, None, self.given, self.swap)(y, share)
+        last = self.table_of.weight, self.table_of.bias
+        return self.network(bind_now, *last, _move_back, None, self.given, self.swap)(y, share)
 
 
 @fused

@@ -10,7 +10,7 @@ import numpy as np
 
 from forbes.data.episode_store import EpisodeStore, EpisodeWriter
 from forbes.data.episodes import EpisodeRecord
-from forbes.data.pictures import draw_strips, save_picture
+from forbes.data.pictures import MAX_CHANNELS, draw_strips, save_picture
 
 __all__ = ["Add", "add_episode_commands", "check", "count_steps", "info"]
 
@@ -23,13 +23,14 @@ def info(path: Path, output: Path | None = None) -> None:
 
     Args:
         path: folder of the store.
-        output: picture to write, by default `frames.png` in the folder; vectors are not drawn.
+        output: picture to write, by default `frames.png` in the folder; only images of at most four channels are drawn.
     """
     store = _opened(path)
     records = sorted(store.records.values(), key=lambda record: record.total_reward)
     for name, value in _facts(store, records):
         print(f"{name:<22}{value}")
-    if len(records[0].environment["observation_shape"]) == 3:
+    shape = records[0].environment["observation_shape"]
+    if len(shape) == 3 and shape[0] <= MAX_CHANNELS:
         chosen = {record.number: record for record in (records[0], records[len(records) // 2], records[-1])}
         rows = [(f"episode {n}\nreturn {one.total_reward:.1f}", store.episode(n)) for n, one in chosen.items()]
         save_picture(draw_strips(rows), output or path / "frames.png")

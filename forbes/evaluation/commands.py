@@ -20,6 +20,7 @@ from forbes.evaluation.measured import SCORES, Measured, note, pair
 from forbes.evaluation.progress import with_progress
 from forbes.evaluation.record import describe, read_record, write_record
 from forbes.evaluation.references import references
+from forbes.evaluation.round_trip import model_round_trip, print_round_trip
 from forbes.evaluation.runs import (
     TrainedRun,
     data_name,
@@ -132,7 +133,7 @@ def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
     for first, second, differences in pair(measured):
         note(first, second, differences)
     for one in measured:
-        write_record(one.run.path, one.entries, one.totals)
+        write_record(one.run.path, one.entries | _round_trip(one.run, args), one.totals)
     for parts in finished:
         parts.remove()
     return measured
@@ -257,6 +258,14 @@ def _count(run: TrainedRun, args: Any, default: int) -> int:
         where = f"the {args.split} split of {run.path}" if size < 2 else f"--sequences {count}"
         raise ForbesError(f"{where}: a standard error needs at least 2 sequences, found {count}. Choose more")
     return count
+
+
+def _round_trip(run: TrainedRun, args: Any) -> dict[str, dict[str, Any]]:
+    """Measure, print and name how well its flows are inverted on the first batch of the split; {} of other families."""
+    _, batch = next(split_batches(run.data, args.split, _count(run, args, args.batch_size), args.batch_size))
+    found = model_round_trip(run.model, batch, args.seed)
+    print_round_trip(run.path, found)
+    return {f"{args.split}/round_trip": found | {"sequences": len(batch.mask), "seed": args.seed}} if found else {}
 
 
 def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib import colors
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
+from forbes.data.pictures import MAX_CHANNELS, to_rgb
 from forbes.errors import ForbesError
 from forbes.figures.style import BLACK, GREY, PAGE, paper_style
 
@@ -26,7 +27,7 @@ class Panel(NamedTuple):
 
     title: str
     images: Tensor
-    """Grey values or colours in [0, 1], rows × columns: `(R, K, C, H, W)`, C 1 or 3."""
+    """Values in [0, 1], rows × columns: `(R, K, C, H, W)`; `to_rgb` says how C channels are shown."""
     colour: str
     """Of the ink, where the frames are grey."""
     labels: Sequence[str] = ()
@@ -60,10 +61,12 @@ def seen_panel(observation: Tensor, context: int) -> Panel:
 
 
 def require_images(where: str, shape: Sequence[int], remedy: str) -> None:
-    """Raise a ForbesError, ended by what to do, unless observations of this shape are images, grey or in colours."""
-    if len(shape) != 3 or shape[0] not in (1, 3):
+    """Raise a ForbesError, ended by what to do, unless observations of this shape are images that `to_rgb` can show."""
+    if len(shape) != 3 or not 1 <= shape[0] <= MAX_CHANNELS:
         found = f"vectors of {shape[0]}" if len(shape) == 1 else f"of shape {tuple(shape)}"
-        raise ForbesError(f"{where}: the observations are {found}, expected images of 1 or 3 channels. {remedy}")
+        raise ForbesError(
+            f"{where}: the observations are {found}, expected images of 1 to {MAX_CHANNELS} channels. {remedy}"
+        )
 
 
 def _frames(observation: Tensor, times: Sequence[int]) -> Tensor:
@@ -155,9 +158,12 @@ def _draw_bars(axes: Axes, bars: Bars) -> None:
 def _mosaic(images: Tensor, colour: str) -> NDArray[np.float32]:
     """Paint frames in ink on white, side by side: `(R, K, C, H, W)` to `(R (H + gap) + gap, K (W + gap) + gap, 3)`."""
     rows, columns, channels, height, width = images.shape
-    frames = images.detach().float().cpu().numpy().transpose(0, 3, 1, 4, 2)  # (R, H, K, W, C)
+    values = images.detach().float().cpu().numpy()
     if channels == 1:
-        frames = 1 - frames * (1 - np.asarray(to_rgb(colour), dtype=np.float32))  # (R, H, K, W, 3)
+        ink = 1 - np.asarray(colors.to_rgb(colour), dtype=np.float32)
+        frames = 1 - values.transpose(0, 3, 1, 4, 2) * ink  # (R, H, K, W, 3)
+    else:
+        frames = to_rgb(values).transpose(0, 3, 1, 4, 2)  # (R, H, K, W, 3)
     canvas = np.full((rows * (height + _GAP) + _GAP, columns * (width + _GAP) + _GAP, 3), _GAP_COLOUR, np.float32)
     for r in range(rows):
         for k in range(columns):

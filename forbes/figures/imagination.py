@@ -27,7 +27,7 @@ def open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, columns:
         columns: frames shown, those of the context among them; the others evenly to the last.
     """
     rows = torch.stack((truth, model, 0.5 + 0.5 * (model - truth)), 1)  # (B, 3, T, C, H, W)
-    white = 1.0 if truth.shape[2] == 3 else 0.0  # grey values are ink
+    white = 0.0 if truth.shape[2] == 1 else 1.0  # grey values are ink
     rows = rows.where(mask[:, None, :, None, None, None], white)
     groups = list(range(1, context + 1)), _later(context, truth.shape[1], columns - context)
     titles = "seen, and reconstructed", "imagined under the true actions"

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from forbes.data.pictures import to_rgb
+
 __all__ = ["gif"]
 
 _FRAME, _LAST_FRAME = 40, 1000
@@ -21,7 +23,7 @@ def gif(episodes: Sequence[NDArray[np.uint8]]) -> bytes:
     A frame has a palette of its own, of 256 colours. A frame like the one before it is not stored but shown for longer.
 
     Args:
-        episodes: the frames of each, all of one size, uint8 `(T, C, H, W)`, C 1 or 3.
+        episodes: the frames of each, all of one size, uint8 `(T, C, H, W)`, C as `to_rgb` takes it.
     """
     first, *others = (picture for episode in episodes for picture in _pictures(episode))
     durations = [_LAST_FRAME if last else _FRAME for one in episodes for last in (*[False] * (len(one) - 1), True)]
@@ -34,6 +36,6 @@ def _pictures(episode: NDArray[np.uint8]) -> Iterator[Image.Image]:
     height, width = episode.shape[2:]
     factor = -(-_SIDE // max(height, width))
     for frame in episode:
-        colours = np.broadcast_to(frame, (3, height, width)).transpose(1, 2, 0)  # (H, W, 3)
+        colours = to_rgb(frame).transpose(1, 2, 0)  # (H, W, 3)
         picture = Image.fromarray(np.ascontiguousarray(colours)).quantize(256)
         yield picture.resize((factor * width, factor * height), Image.Resampling.NEAREST)

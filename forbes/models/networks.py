@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
-from typing import ClassVar, Literal, TypeAlias
+from itertools import chain, pairwise
+from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -23,11 +23,14 @@ __all__ = [
     "Perceptron",
     "activate",
     "bind_gru",
+    "transposed_kernels",
 ]
 
 Activation: TypeAlias = Literal["relu", "elu"]
 _ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU}
 _FUNCTIONS: dict[type[nn.Module], Elementwise] = {nn.ReLU: relu, nn.ELU: elu}
+_KERNEL = 4
+"""Of the encoder's convolutions, pixels a side."""
 
 
 class Perceptron(nn.Sequential):
@@ -150,38 +153,46 @@ class MLPDecoder(Decoder):
         return output.view(-1, *self.observation_shape)  # (N, *O)
 
 
-def _image_size(observation_shape: tuple[int, ...], role: str) -> tuple[int, int]:
-    """Give channels and pixels a side, or raise a ForbesError where observations are no images."""
-    if len(observation_shape) != 3:
+def _convolutions(observation_shape: tuple[int, ...], role: str) -> tuple[int, list[int]]:
+    """Return how many convolutions of kernel 4 and stride 2 fit into an image `(C, H, W)`, and the H and W they leave.
+
+    They end where the shorter side has fewer than 4 pixels.
+
+    Raises:
+        ForbesError: for vectors, or images with a side below 4 pixels.
+    """
+    if len(observation_shape) != 3 or min(observation_shape[1:]) < _KERNEL:
         raise ForbesError(
-            f"Conv{role}: found observations of shape {(*observation_shape,)}, expected images (C, H, W). "
-            f"Use MLP{role} as model.{role.lower()}"
+            f"Conv{role}: found observations of shape {(*observation_shape,)}, expected images (C, H, W) of at least "
+            f"{_KERNEL} pixels a side. Use MLP{role} as model.{role.lower()}"
         )
-    return observation_shape[:2]
+    layers, sides = 0, list(observation_shape[1:])
+    while min(sides) >= _KERNEL:
+        layers, sides = layers + 1, [(side - _KERNEL) // 2 + 1 for side in sides]
+    return layers, sides
 
 
 class ConvEncoder(Encoder):
-    """Dreamer's encoder: convolutions of kernel 4 and stride 2 until fewer than 4 pixels are left.
+    """Dreamer's encoder: convolutions of kernel 4 and stride 2 until the shorter side has fewer than 4 pixels.
 
-    64 pixels: 64-31-14-6-2, E = 1024 at 32 channels. 28 pixels: 28-13-5-1, E = 128.
+    64 pixels: 64-31-14-6-2, E = 1024 at 32 channels. 28 pixels: 28-13-5-1, E = 128. A kernel that does not fit at the
+    right or the lower edge is left out, as in Dreamer: of 64 pixels a side the last 2 are not seen, of 28 the last 6.
 
     Args:
-        observation_shape: (C, H, W).
+        observation_shape: (C, H, W), at least 4 pixels a side.
         channels: of the first layer; each further layer has twice as many.
 
     Raises:
-        ForbesError: for vectors.
+        ForbesError: for vectors, or smaller images.
     """
 
     def __init__(self, observation_shape: tuple[int, ...], channels: int = 32) -> None:
         super().__init__()
-        depth, size = _image_size(observation_shape, "Encoder")
-        blocks: list[nn.Module] = []
-        while size >= 4:
-            blocks += [nn.Conv2d(depth, channels, 4, stride=2), nn.ReLU()]
-            depth, channels, size = channels, 2 * channels, (size - 4) // 2 + 1
-        self.net = nn.Sequential(*blocks)
-        self.embedding_dim = depth * size * size
+        layers, sides = _convolutions(observation_shape, "Encoder")
+        widths = [observation_shape[0], *(channels * 2**layer for layer in range(layers))]
+        blocks = [(nn.Conv2d(before, after, _KERNEL, stride=2), nn.ReLU()) for before, after in pairwise(widths)]
+        self.net = nn.Sequential(*chain(*blocks))
+        self.embedding_dim = widths[-1] * math.prod(sides)
 
     def forward(self, observation: Tensor) -> Tensor:
         """See `Encoder`."""
@@ -190,43 +201,59 @@ class ConvEncoder(Encoder):
 
 
 class ConvDecoder(Decoder):
-    """Dreamer's decoder: a linear layer, then transposed convolutions of stride 2 from one pixel up.
+    r"""Dreamer's decoder: a linear layer, then as many transposed convolutions of stride 2 as the encoder has layers.
 
-    64 pixels: kernels 5, 5, 6, 6 (1-5-13-30-64). 28 pixels: kernels 5, 5, 4 (1-5-13-28).
+    The linear layer makes a map with one pixel a side fewer than the encoder ends with, at least one. Its channels are
+    `channels` times half the shorter side, rounded down to a power of two: 32 times for 64 pixels, 8 times for 28.
+
+    64 pixels: kernels 5, 5, 6, 6 (1-5-13-30-64), 3,795,555 parameters with 230 features and 3 channels. 28 pixels:
+    kernels 5, 5, 4 (1-5-13-28). Sides of different length have kernels of their own (`transposed_kernels`).
 
     Args:
         feature_dim: F.
-        observation_shape: (C, H, W), H = W = 64 or 28.
+        observation_shape: (C, H, W), at least 4 pixels a side.
         channels: of the last hidden layer; each layer before has twice as many.
         output_bias: the output it starts from, see `MLPDecoder`.
 
     Raises:
-        ForbesError: for another size, or vectors.
+        ForbesError: for vectors, or smaller images.
     """
-
-    kernels: ClassVar = {64: (5, 5, 6, 6), 28: (5, 5, 4)}
 
     def __init__(
         self, feature_dim: int, observation_shape: tuple[int, ...], channels: int = 32, output_bias: float = 0.0
     ) -> None:
         super().__init__()
-        depth, size = _image_size(observation_shape, "Decoder")
-        if size not in self.kernels:
-            raise ForbesError(f"ConvDecoder: observations have {size} pixels, expected 28 or 64. Use MLPDecoder")
-        kernels = self.kernels[size]
-        widths = [channels * 2 ** (len(kernels) - k - 1) for k in range(1, len(kernels))] + [depth]
-        self.start_dim = channels * 2 ** len(kernels)
-        self.start = nn.Linear(feature_dim, self.start_dim)
-        layers = [
+        layers, encoded = _convolutions(observation_shape, "Decoder")
+        depth, *sides = observation_shape
+        first = [max(side - 1, 1) for side in encoded]
+        self.start_shape = channels * 2 ** (min(sides).bit_length() - 2), *first  # (C_0, H_0, W_0)
+        self.start = nn.Linear(feature_dim, math.prod(self.start_shape))
+        kernels = zip(*(transposed_kernels(*ends, layers) for ends in zip(first, sides, strict=True)), strict=True)
+        widths = [self.start_shape[0], *(channels * 2**layer for layer in reversed(range(layers - 1))), depth]
+        convolutions = [
             nn.ConvTranspose2d(before, after, kernel, stride=2)
-            for (before, after), kernel in zip(pairwise([self.start_dim, *widths]), kernels, strict=True)
+            for (before, after), kernel in zip(pairwise(widths), kernels, strict=True)
         ]
         if output_bias:
-            nn.init.constant_(layers[-1].get_parameter("bias"), output_bias)
-        blocks = [block for layer in layers for block in (layer, nn.ReLU())]
+            nn.init.constant_(convolutions[-1].get_parameter("bias"), output_bias)
+        blocks = [block for convolution in convolutions for block in (convolution, nn.ReLU())]
         self.net = nn.Sequential(*blocks[:-1])
 
     def forward(self, features: Tensor) -> Tensor:
         """See `Decoder`."""
-        output: Tensor = self.net(self.start(features).unflatten(-1, (self.start_dim, 1, 1)))  # (N, C, H, W)
+        output: Tensor = self.net(self.start(features).unflatten(-1, self.start_shape))  # (N, C, H, W)
         return output
+
+
+def transposed_kernels(first: int, last: int, layers: int) -> list[int]:
+    r"""Return the kernels by which transposed convolutions of stride 2 enlarge a side from `first` to `last` pixels.
+
+    .. math:: n_l = 2 (n_{l-1} - 1) + k_l \quad\Rightarrow\quad
+              n_L - 2^L n_0 = \sum_{l=1}^{L} 2^{L-l} (k_l - 2)
+
+    All are equal, or some larger by one: those where the binary digits of the remainder of
+    :math:`(n_L - 2^L n_0) / (2^L - 1)` are 1. From 1 to 64 in four layers: 48 = 3 · 15 + 3, so 5, 5, 6, 6, which is
+    Dreamer's choice.
+    """
+    base, rest = divmod(last - 2**layers * first, 2**layers - 1)
+    return [2 + base + (rest >> layer & 1) for layer in reversed(range(layers))]

@@ -8,7 +8,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import BLUE
-from forbes.training.callbacks.picture import PictureCallback, require_context, to_device
+from forbes.training.callbacks.picture import PictureCallback, require_context, require_frames, to_device
 from forbes.training.world_model import WorldModel
 
 __all__ = ["PredictionGrid"]
@@ -38,7 +38,8 @@ class PredictionGrid(PictureCallback):
         self.digits, self.samples, self.context = digits, samples, context
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse a context that leaves nothing to predict, before hours are spent."""
+        """Refuse what cannot be drawn, before hours are spent."""
+        require_frames(self, trainer)
         require_context(self, trainer, self.context)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:

@@ -1,0 +1,77 @@
+"""Frames of one to four channels, and of sides that differ, in every picture that has frames."""
+
+import io
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from forbes.data.pictures import draw_strips, to_rgb
+from forbes.errors import ForbesError
+from forbes.figures.grids import Panel, draw_panels, require_images
+from forbes.figures.imagination import imagined_futures, open_loop
+from forbes.figures.video import gif
+
+CHANNELS = pytest.mark.parametrize("channels", [1, 2, 3, 4])
+HEIGHT, WIDTH = 6, 10
+
+
+def frames(*shape, channels):
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(*shape, channels, HEIGHT, WIDTH, generator=generator)
+
+
+@pytest.mark.parametrize(("channels", "colours"), [(1, [1, 1, 1]), (2, [1, 2, 2]), (3, [1, 2, 3]), (4, [1, 2, 3])])
+def test_channels_become_three_colours(channels, colours):
+    values = np.arange(1, channels + 1, dtype=np.uint8).reshape(1, channels, 1, 1)
+
+    shown = to_rgb(values)
+
+    assert shown.dtype == np.uint8
+    assert shown.tolist() == np.reshape(colours, (1, 3, 1, 1)).tolist()
+
+
+@CHANNELS
+def test_a_panel_shows_each_frame_in_its_place(channels):
+    images = frames(2, 3, channels=channels)
+
+    figure = draw_panels([Panel("frames", images, "black")])
+
+    picture = np.asarray(figure.axes[0].images[0].get_array())
+    assert picture.shape == (2 * (HEIGHT + 2) + 2, 3 * (WIDTH + 2) + 2, 3)
+    last = picture[HEIGHT + 4 : -2, 2 * WIDTH + 6 : -2]
+    values = images[1, 2].numpy()
+    np.testing.assert_allclose(last.transpose(2, 0, 1), 1 - to_rgb(values) if channels == 1 else to_rgb(values))
+
+
+@CHANNELS
+def test_imagination_is_drawn(channels):
+    truth = frames(2, 5, channels=channels)
+    mask = torch.ones(2, 5, dtype=torch.bool)
+    mask[1, 4] = False
+
+    panels = open_loop(truth, truth, mask, context=2, columns=4)
+    futures = imagined_futures(truth[0], truth[:, 2:], context=2, columns=3)
+
+    after_the_end = np.asarray(panels.axes[3].images[0].get_array())[2 : 2 + HEIGHT, -2 - WIDTH : -2]
+    np.testing.assert_array_equal(after_the_end, np.ones((HEIGHT, WIDTH, 3)))
+    assert len(futures.axes) == 4
+
+
+@CHANNELS
+def test_an_episode_is_filmed_and_drawn_as_a_strip(channels):
+    observation = (255 * frames(4, channels=channels)).to(torch.uint8).numpy()
+
+    film = Image.open(io.BytesIO(gif([observation])))
+    strip = draw_strips([("episode", SimpleNamespace(observation=observation, reward=np.zeros(4)))])
+
+    assert film.size == (26 * WIDTH, 26 * HEIGHT)
+    assert np.asarray(strip.axes[0].images[0].get_array()).shape == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize("shape", [(5, 8, 8), (0, 8, 8), (7,), (8, 8)])
+def test_what_is_no_picture_is_refused_in_one_sentence(shape):
+    with pytest.raises(ForbesError, match=r"run: the observations are .*, expected images of 1 to 4 channels\. Do so"):
+        require_images("run", shape, "Do so")
