@@ -45,8 +45,8 @@ class _TrainIndices:
 
 def _batches_taken(trainer: Trainer) -> int:
     """Count the training batches so far; with `overfit_batches` those of this epoch, since all epochs share theirs."""
-    loop = trainer.fit_loop
-    return 1 + (loop.batch_idx if trainer.overfit_batches else loop.total_batch_idx)
+    loop, same = trainer.fit_loop, trainer.overfit_batches  # type: ignore[attr-defined]  # set by a helper of Lightning
+    return 1 + (loop.batch_idx if same else loop.total_batch_idx)
 
 
 class SequenceDataModule(LightningDataModule):

@@ -80,11 +80,11 @@ class SaveLast(Checkpoint):
         rest of it. In the checkpoint it is not.
         """
         missing, epochs = int(not trainer.is_last_batch), trainer.fit_loop.epoch_progress
-        for count in (epochs.current, epochs.total):
-            count.processed -= missing
+        epochs.current.processed -= missing
+        epochs.total.processed -= missing
         trainer.save_checkpoint(self.run.checkpoint)
-        for count in (epochs.current, epochs.total):
-            count.processed += missing
+        epochs.current.processed += missing
+        epochs.total.processed += missing
 
 
 class ResumeWholeEpochs(Callback):

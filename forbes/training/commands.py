@@ -27,7 +27,7 @@ from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.training.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_by_lightning, raised_inside
-from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults
+from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults, data_paths
 from forbes.training.loading import check_weights
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
@@ -117,6 +117,9 @@ class _Experiment(LightningCLI):
         self.command, self.arguments, self.stack = command, arguments, stack
         options = _run_options()
         self.options, rest = options.parse_known_args(arguments if command == "fit" else [])
+        for option in ("resume", "run_dir"):
+            if (folder := getattr(self.options, option)) and folder.endswith(".ckpt"):
+                raise ForbesError(f"--{option} {folder}: is the name of a checkpoint, expected that of a run folder")
         self.resumed = RunFolder.trained(self.options.resume) if self.options.resume else None
         if command != "fit":
             rest = list(arguments)
@@ -159,8 +162,11 @@ class _Experiment(LightningCLI):
             )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Parse; Lightning's own would warn that the process has arguments, too."""
+        """Parse; Lightning's own would warn that the process has arguments, too. A run knows its data from anywhere."""
         self.config = parser.parse_args(args)
+        data = self.config["data"]
+        for key, path in data_paths(data).items():
+            data[key] = str(Path(path).absolute())
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Build the trainer; for `fit` with a run folder and all that fills it."""
