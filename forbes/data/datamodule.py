@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import torch
-from lightning import LightningDataModule
+from lightning import LightningDataModule, Trainer
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
@@ -29,18 +29,24 @@ class _Batches(IterableDataset[Any]):
 
 
 class _TrainIndices:
-    """Indices of the batches from the trainer's update on, chosen by the source."""
+    """Indices of an epoch's batches, chosen by the source: those after the ones that the trainer has taken."""
 
     def __init__(self, datamodule: "SequenceDataModule") -> None:
         self.datamodule = datamodule
 
     def __iter__(self) -> Iterator[Tensor]:
         trainer = self.datamodule.trainer
-        first = trainer.global_step if trainer is not None else 0
-        return (self.datamodule.train_index(update) for update in range(first, first + len(self)))
+        first = _batches_taken(trainer) if trainer is not None else 0
+        return (self.datamodule.train_index(number) for number in range(first, first + len(self)))
 
     def __len__(self) -> int:
         return self.datamodule.updates_per_epoch
+
+
+def _batches_taken(trainer: Trainer) -> int:
+    """Count the training batches so far; with `overfit_batches` those of this epoch, since all epochs share theirs."""
+    loop, same = trainer.fit_loop, trainer.overfit_batches  # type: ignore[attr-defined]  # set by a helper of Lightning
+    return 1 + (loop.batch_idx if same else loop.total_batch_idx)
 
 
 class SequenceDataModule(LightningDataModule):
@@ -106,12 +112,12 @@ class SequenceDataModule(LightningDataModule):
         """See the sequences that there were at the checkpoint."""
         self.source.watermark = state_dict["watermark"]
 
-    def train_index(self, update: int) -> Tensor:
+    def train_index(self, number: int) -> Tensor:
         """Give the indices of one training batch, `(B,)`, int64."""
-        return self.source.train_index(self.batch_size, self.length, self.seed, update)
+        return self.source.train_index(self.batch_size, self.length, self.seed, number)
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Give `updates_per_epoch` batches, from the trainer's current update on."""
+        """Give `updates_per_epoch` batches, after those that the trainer has taken."""
         return self._loader("train", _TrainIndices(self))
 
     def val_dataloader(self) -> DataLoader[Any]:

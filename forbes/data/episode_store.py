@@ -51,6 +51,11 @@ class EpisodeStore:
 
     def require_episodes(self) -> None:
         """Raise a ForbesError where there are none."""
+        if not self.path.is_dir():
+            raise ForbesError(
+                f"{self.path}: no such folder. Name one that has episodes, or collect some: "
+                f"forbes data collect --task TASK -o {self.path}"
+            )
         if not self.records:
             damaged = len([*self.path.glob("quarantine/*.npz")])
             raise ForbesError(

@@ -2,8 +2,9 @@
 
 import itertools
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -63,15 +64,15 @@ def is_agent(run: str) -> bool:
 
 
 def evaluate_agents(
-    runs: Sequence[str], episodes: int, samples: int | None, seed: int, device: str, command: str
+    runs: Mapping[str, Path], episodes: int, samples: int | None, seed: int, device: str, command: str
 ) -> None:
-    """Let every agent play the same episodes, record its returns in its run folder, and print a table.
+    """Let every agent play the same episodes, record its returns, and print a table.
 
     Episode k of every run is reset with the same seed, none of which was used in a training. The action is the policy's
     mode, or the plan, without noise.
 
     Args:
-        runs: run folders.
+        runs: run folders, and the folder for the record of each.
         episodes: E, at least 2.
         samples: K, trajectories of the belief that each action is chosen by; None for the agent's own.
         seed: of the episodes.
@@ -84,12 +85,12 @@ def evaluate_agents(
     if episodes < 2:
         raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
     played = list[_Played]()
-    for run in runs:
+    for run, folder in runs.items():
         with loaded_agent(run, device, samples) as (agent, environment):
             for first in played[:1]:
                 _require_same_task(first, run, describe_environment(environment))
             played.append(_play(run, agent, environment, episodes, seed))
-        _record(played[-1], seed, command)
+        _record(played[-1], folder, seed, command)
     _print(played)
 
 
@@ -123,7 +124,7 @@ def _known_process(environment: EnvironmentProcess) -> Process | None:
     return known.process if isinstance(known, KnownProcess) else None
 
 
-def _record(one: _Played, seed: int, command: str) -> None:
+def _record(one: _Played, folder: Path, seed: int, command: str) -> None:
     measured = {
         "checkpoint": RunFolder(one.run).checkpoint_sha256(),
         "command": command,
@@ -146,7 +147,7 @@ def _record(one: _Played, seed: int, command: str) -> None:
     }
     shares |= {f"{metric}[{tag}]": estimate._asdict() | measured for metric, estimate in one.belief.items()}
     name = f"return[{tag}]"
-    write_record(one.run, {name: entry | measured} | shares, {name: one.returns})
+    write_record(folder, {name: entry | measured} | shares, {name: one.returns})
 
 
 def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int) -> Episode:

@@ -4,7 +4,7 @@ import argparse
 import itertools
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -18,7 +18,7 @@ from forbes.evaluation.agents import add_acting_samples, evaluate_agents, is_age
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.measured import SCORES, Measured, note, pair
 from forbes.evaluation.progress import with_progress
-from forbes.evaluation.record import describe, read_record, write_record
+from forbes.evaluation.record import describe, read_record, results_folders, write_record
 from forbes.evaluation.references import references
 from forbes.evaluation.round_trip import model_round_trip, print_round_trip
 from forbes.evaluation.runs import (
@@ -95,11 +95,14 @@ def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = _parser().parse_args(argv)
     command = command_line("evaluate", *argv)
+    if args.checkpoint is not None:
+        args.runs = [str(Path(run) / "checkpoints" / args.checkpoint) for run in args.runs]
+    folders = results_folders(args.runs, args.output)
     if is_agent(args.runs[0]):
         return evaluate_agents(
-            args.runs, args.episodes, args.acting_samples, args.seed, find_device(args.device), command
+            folders, args.episodes, args.acting_samples, args.seed, find_device(args.device), command
         )
-    measured = evaluate(args.runs, args, command)
+    measured = evaluate(args.runs, args, command, folders)
     print_runs(measured)
     print_references(measured)
     if len(measured) > 1:
@@ -107,24 +110,28 @@ def main(argv: Sequence[str]) -> None:
     print_degradation(measured)
 
 
-def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
-    """Measure runs on the same sequences and record it in their folders.
+def evaluate(
+    paths: Sequence[str], args: Any, command: str, folders: Mapping[str, Path] | None = None
+) -> list[Measured]:
+    """Measure runs on the same sequences and record it.
 
     Args:
         paths: run folders.
         args: with the options of `add_score_options`.
         command: for the record.
+        folders: where the record of each run goes; into the run by default.
     """
+    folders = folders or results_folders(paths)
     runs = load_runs(paths, find_device(args.device))
     jobs = _jobs(args, runs)
     for run in runs:
-        read_record(run.path)  # a broken one is said before minutes are spent
+        read_record(folders[run.path])  # a broken one is said before minutes are spent
     finished: list[Parts] = []
     measured = []
     for number, run in enumerate(runs):
         one = Measured(run, {}, {})
         for job in _of(run, jobs):
-            finished.append(_measure(one, job, job.sha256[number], args))
+            finished.append(_measure(one, job, job.sha256[number], args, folders[run.path]))
         _add_references(one, jobs, args.split)
         for entry in one.entries.values():
             date = datetime.now(UTC).isoformat(timespec="seconds")
@@ -133,7 +140,7 @@ def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
     for first, second, differences in pair(measured):
         note(first, second, differences)
     for one in measured:
-        write_record(one.run.path, one.entries | _round_trip(one.run, args), one.totals)
+        write_record(folders[one.run.path], one.entries | _round_trip(one.run, args), one.totals)
     for parts in finished:
         parts.remove()
     return measured
@@ -168,7 +175,11 @@ def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[dict[str, bool
 
 def _parser() -> ArgumentParser:
     parser = ArgumentParser("forbes evaluate", _DESCRIPTION)
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made")
+    parser.add_argument(
+        "runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made, or a checkpoint in it"
+    )
+    parser.add_argument("--checkpoint", metavar="NAME", help="another than last.ckpt, in checkpoints/ of every RUN")
+    parser.add_argument("--output", metavar="DIR", help="results go to DIR/NAME-OF-RUN, not into the run folders")
     parser.add_argument("--episodes", type=positive, default=10, help="that an agent plays (default: 10)")
     add_acting_samples(parser)
     add_score_options(parser)
@@ -276,13 +287,11 @@ def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
     return f"{split}{part}/{metric}[{tag}]"
 
 
-def _measure(one: Measured, job: _Job, sha256: str, args: Any) -> Parts:
+def _measure(one: Measured, job: _Job, sha256: str, args: Any, folder: Path) -> Parts:
     """Make a pass for a run and add what it finds; give the parts it has left, to be removed in the end."""
     run, score = one.run, job.score
     checkpoint = RunFolder(run.path).checkpoint_sha256()
-    parts = Parts(
-        Path(run.path) / "evaluation-parts", checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed
-    )
+    parts = Parts(folder / "evaluation-parts", checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed)
     began = time.monotonic()
     batches = split_batches(run.data, args.split, job.sequences, score.batch_size)
     batches = with_progress(batches, f"{run.path} {job.name}", job.sequences)

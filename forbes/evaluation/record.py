@@ -7,6 +7,8 @@ Measuring a metric again replaces its entry.
 
 import io
 import json
+import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,9 @@ from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.scoring import Scores
 from forbes.files import replace_file
+from forbes.training.run_folder import RunFolder
 
-__all__ = ["describe", "read_arrays", "read_record", "write_record"]
+__all__ = ["describe", "read_arrays", "read_record", "results_folders", "write_record"]
 
 
 def describe(scores: Scores, metric: str) -> dict[str, Any]:
@@ -38,9 +41,34 @@ def describe(scores: Scores, metric: str) -> dict[str, Any]:
     }
 
 
-def read_record(run: str) -> dict[str, Any]:
+def results_folders(runs: Sequence[str], output: str | None = None) -> dict[str, Path]:
+    """Say where the results of each run go.
+
+    Args:
+        runs: run folders, or checkpoints in them.
+        output: a folder that gets one for each run, of its name; by default results go into the run folder.
+
+    Raises:
+        ForbesError: where two runs would have the same folder in `output`, or a folder cannot be written to.
+    """
+    folders: dict[str, Path] = {}
+    for run in runs:
+        folder = RunFolder(run)
+        place = folder.results
+        if output is not None:
+            name = folder.path.resolve().name
+            place = Path(output) / (name if place == folder.path else f"{name}-{folder.checkpoint.stem}")
+            if place in folders.values():
+                raise ForbesError(f"{run}: another run is called {name} too. Evaluate them with different --output")
+        if folder.path.is_dir() and output is None and not os.access(folder.path, os.W_OK):
+            raise ForbesError(f"{run}: cannot be written to. Let the results go elsewhere: --output DIR")
+        folders[run] = place
+    return folders
+
+
+def read_record(run: str | Path) -> dict[str, Any]:
     """Read `evaluation.json`; a run that was never evaluated has an empty one."""
-    path = Path(run) / "evaluation.json"
+    path = RunFolder(run).results / "evaluation.json"
     if not path.exists():
         return {}
     try:
@@ -50,20 +78,20 @@ def read_record(run: str) -> dict[str, Any]:
     return record
 
 
-def read_arrays(run: str) -> dict[str, NDArray[np.float64]]:
+def read_arrays(run: str | Path) -> dict[str, NDArray[np.float64]]:
     """Read `evaluation.npz`, the scores of each sequence by metric; none before the first evaluation."""
-    path = Path(run) / "evaluation.npz"
+    path = RunFolder(run).results / "evaluation.npz"
     if not path.exists():
         return {}
     with np.load(path, allow_pickle=False) as arrays:
         return dict(arrays)
 
 
-def write_record(run: str, entries: dict[str, dict[str, Any]], totals: dict[str, Tensor]) -> None:
+def write_record(run: str | Path, entries: dict[str, dict[str, Any]], totals: dict[str, Tensor]) -> None:
     """Replace entries of `evaluation.json`, and the scores of each sequence, `(N,)`, in `evaluation.npz`."""
     record = read_record(run) | entries
     arrays = read_arrays(run) | {name: values.numpy() for name, values in totals.items()}
     content = io.BytesIO()
     np.savez(content, **arrays)
-    replace_file(Path(run) / "evaluation.npz", content.getvalue())
-    replace_file(Path(run) / "evaluation.json", (json.dumps(record, indent=2) + "\n").encode())
+    replace_file(RunFolder(run).results / "evaluation.npz", content.getvalue())
+    replace_file(RunFolder(run).results / "evaluation.json", (json.dumps(record, indent=2) + "\n").encode())

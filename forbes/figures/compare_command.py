@@ -129,7 +129,9 @@ def _require_same_configuration(run: str, config: str, seed: int, flags: Sequenc
     Callbacks do not count, since they watch; nor do keys that the run's version of this package did not have.
     """
     own = _flat(yaml.safe_load(RunFolder(run).config.read_text()))
+    own |= {key: str(Path(own[key]).absolute()) for key in own if key.endswith(".path") and own[key]}
     asked = _flat(yaml.safe_load(_configuration(config, *flags))) | {key: seed for key in _SEEDS}
+    asked |= {key: str(Path(asked[key]).absolute()) for key in asked if key.endswith(".path") and asked[key]}
     for key in asked:
         if key in own and own[key] != asked[key] and key != "trainer.callbacks":
             raise ForbesError(

@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import CheckpointIO
-from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.callbacks import Callback, Checkpoint
 
 from forbes.errors import ForbesError
 from forbes.files import fsync_folder
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["AtomicCheckpointIO", "SaveLast", "read_checkpoint"]
+__all__ = ["AtomicCheckpointIO", "ResumeWholeEpochs", "SaveLast", "read_checkpoint"]
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -74,8 +74,33 @@ class SaveLast(Checkpoint):
         self.run = run
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save; every other callback has ended its epoch."""
+        """Save; every other callback has ended its epoch.
+
+        Lightning counts an epoch that `max_steps` or `max_time` has cut short as done, and a resumed run would miss the
+        rest of it. In the checkpoint it is not.
+        """
+        missing, epochs = int(not trainer.is_last_batch), trainer.fit_loop.epoch_progress
+        epochs.current.processed -= missing
+        epochs.total.processed -= missing
         trainer.save_checkpoint(self.run.checkpoint)
+        epochs.current.processed += missing
+        epochs.total.processed += missing
+
+
+class ResumeWholeEpochs(Callback):
+    """Lets a training with `max_steps` go on from the end of an epoch.
+
+    Lightning 2.6 takes every checkpoint for one of the middle of an epoch where `max_steps` is set, and ends that epoch
+    twice. So the limit is out of its sight while it loads the checkpoint.
+    """
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take the limit away; the checkpoint is loaded next."""
+        self._max_steps, trainer.fit_loop.epoch_loop.max_steps = trainer.max_steps, -1
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Set it again."""
+        trainer.fit_loop.epoch_loop.max_steps = self._max_steps
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

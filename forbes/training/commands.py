@@ -1,15 +1,17 @@
 """The commands `forbes fit`, `validate`, `test` and `predict`: a configuration, run by Lightning's Trainer."""
 
 import argparse
+import itertools
 import logging
 import signal
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 from jsonargparse import DefaultHelpFormatter
 from lightning import LightningModule, Trainer
@@ -18,19 +20,21 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
+from torch import Tensor
 
 import forbes.training.callbacks  # noqa: F401  so that configurations know them by their short names
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
-from forbes.training.checkpoint import AtomicCheckpointIO, SaveLast, read_checkpoint
-from forbes.training.config_errors import one_sentence, raised_inside
-from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults
+from forbes.training.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
+from forbes.training.config_errors import one_sentence, raised_by_lightning, raised_inside
+from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults, data_paths
 from forbes.training.loading import check_weights
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
 from forbes.training.provenance import RecordRun
 from forbes.training.run_folder import RunFolder, experiment_name
 from forbes.training.stop import StopOnSignal
+from forbes.training.trainer_arguments import require_usable
 
 __all__ = ["fit", "predict", "test", "validate"]
 
@@ -38,14 +42,16 @@ DESCRIPTION = {
     "fit": "Train a model. It leaves a run folder with the configuration, metrics, checkpoint and figures.",
     "validate": "Run the validation loop of a trained model.",
     "test": "Run the test loop of a trained model; `forbes evaluate` measures it with care.",
-    "predict": "Run the prediction loop of a trained model.",
+    "predict": "Print a line for each sequence of the test split: the bound of a world model in nats, or -log q of "
+    "each true state.",
 }
-
+_LIMITS = ("max_epochs", "max_steps", "max_time", "limit_train_batches")
 
 _NOT_OURS = (  # warnings that say nothing true or useful here
     ".*does not have many workers.*",  # a batch is gathered in less time than a worker needs to hand it over
     ".*dataloader is not resumable.*",  # it goes on from the trainer's update
     ".*`IterableDataset` has `__len__` defined.*",  # there are no workers
+    ".*You requested to overfit but enabled .* dataloader shuffling.*",  # nor do they shuffle
     ".*treespec, LeafSpec.*",  # Lightning 2.6 calls torch 2.13 the old way
     "(?s).*JsonargparseDeprecationWarning",  # and jsonargparse 4.53
     "(?s).*instantiate_classes",
@@ -76,6 +82,8 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     """Run a command and turn what the libraries say about a wrong configuration into one sentence."""
     for name in ("lightning.fabric", "lightning.pytorch"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    for name in ("profilers.profiler", "callbacks.model_summary"):  # what they say has been asked for
+        logging.getLogger(f"lightning.pytorch.{name}").setLevel(logging.INFO)
     allow_modules()
     with ExitStack() as stack, warnings.catch_warnings():
         for message in _NOT_OURS:
@@ -84,11 +92,11 @@ def _run(command: str, arguments: Sequence[str]) -> int:
             return _Experiment(command, arguments, stack).execute()
         except argparse.ArgumentError as error:
             raise ForbesError(one_sentence(str(error), arguments)) from error
-        except MisconfigurationException as error:
-            raise ForbesError(" ".join(str(error).split())) from error
-        except ValueError as error:
+        except (MisconfigurationException, ImportError, RuntimeError, TypeError, ValueError) as error:
             if inner := raised_inside(error):
                 raise inner from None
+            if raised_by_lightning(error):
+                raise ForbesError(" ".join(str(error).split())) from error
             raise
 
 
@@ -109,6 +117,9 @@ class _Experiment(LightningCLI):
         self.command, self.arguments, self.stack = command, arguments, stack
         options = _run_options()
         self.options, rest = options.parse_known_args(arguments if command == "fit" else [])
+        for option in ("resume", "run_dir"):
+            if (folder := getattr(self.options, option)) and folder.endswith(".ckpt"):
+                raise ForbesError(f"--{option} {folder}: is the name of a checkpoint, expected that of a run folder")
         self.resumed = RunFolder.trained(self.options.resume) if self.options.resume else None
         if command != "fit":
             rest = list(arguments)
@@ -151,12 +162,16 @@ class _Experiment(LightningCLI):
             )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Parse; Lightning's own would warn that the process has arguments, too."""
+        """Parse; Lightning's own would warn that the process has arguments, too. A run knows its data from anywhere."""
         self.config = parser.parse_args(args)
+        data = self.config["data"]
+        for key, path in data_paths(data).items():
+            data[key] = str(Path(path).absolute())
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Build the trainer; for `fit` with a run folder and all that fills it."""
         config = self.config_init["trainer"]
+        require_usable(config, self.model, self.datamodule)
         callbacks, plugins = _as_list(config["callbacks"]), _as_list(config["plugins"])
         if config["enable_progress_bar"] is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(progress())
@@ -176,7 +191,7 @@ class _Experiment(LightningCLI):
         print(f"run folder: {run}", flush=True)
         self.stop = StopOnSignal(run)
         self.save_config_kwargs = {"run": run, "stop": self.stop, "arguments": [self.command, *self.arguments]}
-        callbacks += [MarkStart(), self.stop]
+        callbacks += [ResumeWholeEpochs(), MarkStart(), self.stop]
         if config["enable_checkpointing"] is not False:
             callbacks.append(SaveLast(run))
         loggers = config["logger"]
@@ -202,17 +217,46 @@ class _Experiment(LightningCLI):
     def execute(self) -> int:
         """Run the command and give its exit status."""
         checkpoint = self.resumed.checkpoint if self.resumed else self.config.get("ckpt_path")
+        updates = 0
         if checkpoint:
-            check_weights(self.model, read_checkpoint(Path(checkpoint))["state_dict"], str(checkpoint))
+            content = read_checkpoint(Path(checkpoint))
+            check_weights(self.model, content["state_dict"], str(checkpoint))
+            updates = content["global_step"]
+        how = {"datamodule": self.datamodule, "ckpt_path": checkpoint, "weights_only": True}
+        if self.command in ("validate", "test"):
+            how["verbose"] = False  # Lightning's table would leave out what is in brackets
         try:
-            run = getattr(self.trainer, self.command)
-            run(self.model, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
+            found = getattr(self.trainer, self.command)(self.model, **how)
         except SIGTERMException:
             if self.stop is None:
                 return 128 + signal.SIGTERM
             print(f"stopped at update {self.trainer.global_step}, go on with: forbes fit --resume {self.stop.run}")
             return self.stop.exit_status
+        if self.command == "predict":
+            _print_predictions(found)
+        elif self.command != "fit":
+            _print_metrics(found)
+        elif self.trainer.global_step == updates:
+            print(f"nothing was trained: {self._limits()} ends it at update {updates}. Give a higher limit to train on")
         return 0
+
+    def _limits(self) -> str:
+        """Name what may end the training before it begins, as the configuration says it."""
+        trainer = self.config["trainer"]
+        names = [name for name in _LIMITS if trainer[name] not in (None, -1)]
+        return ", ".join(f"{name} {trainer[name]}" for name in names)
+
+
+def _print_metrics(found: Sequence[Mapping[str, float]]) -> None:
+    """Print one metric a line."""
+    for name, value in itertools.chain.from_iterable(metrics.items() for metrics in found):
+        print(f"{name}  {value}")
+
+
+def _print_predictions(found: Sequence[Tensor]) -> None:
+    """Print one sequence a line, its numbers `(B,)` or `(B, T)` apart by tabs."""
+    for values in torch.cat(list(found)).tolist():
+        print(*(values if isinstance(values, list) else [values]), sep="\t")
 
 
 def _as_list(value: Any) -> list[Any]:

@@ -5,6 +5,7 @@ import inspect
 import itertools
 import pydoc
 import re
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from torch import nn
 from forbes.data import SequenceSource
 from forbes.errors import ForbesError
 
-__all__ = ["one_sentence", "raised_inside"]
+__all__ = ["one_sentence", "raised_by_lightning", "raised_inside"]
 
 TOP_LEVEL = ("model", "data", "trainer", "seed_everything", "config", "ckpt_path")
 CONFIGURABLE = (nn.Module, LightningDataModule, SequenceSource, Callback, Logger)
@@ -119,3 +120,9 @@ def raised_inside(error: BaseException) -> ForbesError | None:
     while inner is not None and not isinstance(inner, ForbesError):
         inner = inner.__cause__
     return inner
+
+
+def raised_by_lightning(error: BaseException) -> bool:
+    """Tell whether Lightning itself has raised an error: its message is then about how it was used."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return str(frame.f_globals["__name__"]).startswith("lightning.")

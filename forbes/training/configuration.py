@@ -5,14 +5,15 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jsonargparse import set_parsing_settings
+from jsonargparse import Namespace, set_parsing_settings
 from lightning import LightningModule
 from lightning.pytorch.cli import LightningArgumentParser
 
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 
-__all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "changed_defaults", "experiment_parser"]
+__all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "changed_defaults", "data_paths"]
+__all__ += ["experiment_parser"]
 
 TRUSTED = ("forbes", "lightning", "torch")
 _allowed: dict[str, None] = {}  # in their order, as long as the process lives: jsonargparse keeps them too
@@ -71,6 +72,11 @@ def changed_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(source, dict) or not str(source.get("class_path")).endswith("Strokes"):
         return {}
     return {} if "frames" in source.get("init_args", {}) else {"data.init_args.source.init_args.frames": "whole"}
+
+
+def data_paths(data: Namespace) -> dict[str, str]:
+    """Return the files and folders that the section `data` names, by key: all arguments called `path`."""
+    return {key: value for key, value in data.items() if key.split(".")[-1] == "path" and isinstance(value, str)}
 
 
 def experiment_parser() -> LightningArgumentParser:

@@ -19,7 +19,7 @@ from forbes.pomdps.base import require_positive
 from forbes.pomdps.distributions import PointMass
 from forbes.precision import full_precision
 from forbes.seeding import derive_seed, generator
-from forbes.training.world_model import follow_rates
+from forbes.training.world_model import batches_before, follow_rates
 
 __all__ = ["KnownBelief", "Objective", "has_transition_density"]
 
@@ -113,8 +113,8 @@ class KnownBelief(LightningModule):
             return elbo_loss(self.model.elbo(batch.observation, batch.action, batch.mask))
 
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
-        """Seed the noise of this update, so that a resumed run draws the same."""
-        torch.manual_seed(derive_seed(self.seed, "update", self.global_step))
+        """Seed the noise of this batch, so that a resumed run draws the same."""
+        torch.manual_seed(derive_seed(self.seed, "update", batches_before(self)))
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Give and log the loss of one update."""

@@ -1,4 +1,4 @@
-"""Load what a run has learned: the model and the data of its configuration, with the weights of its last checkpoint."""
+"""Load what a run has learned: the model and the data of its configuration, with the weights of a checkpoint."""
 
 import argparse
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ from forbes.errors import ForbesError
 from forbes.training.acting import ActingModel
 from forbes.training.checkpoint import read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside
-from forbes.training.configuration import allow_modules, changed_defaults, experiment_parser
+from forbes.training.configuration import allow_modules, changed_defaults, data_paths, experiment_parser
 from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder
 from forbes.training.world_model import WorldModel
@@ -28,6 +28,9 @@ Module = TypeVar("Module", bound=LightningModule)
 
 def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
     """Load a run's world model, on the CPU and in evaluation mode, and its data, without a Trainer.
+
+    Args:
+        run: its folder, for the last checkpoint, or a checkpoint in it.
 
     Raises:
         ForbesError: when the folder holds no trained run or one of another kind, or its configuration and its
@@ -55,6 +58,10 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
         )
     except argparse.ArgumentError as error:
         raise ForbesError(f"{folder.config}: {one_sentence(str(error))}") from error
+    for key, path in data_paths(parsed["data"]).items():
+        if not Path(path).exists():
+            name = "data." + key.replace("init_args.", "")
+            raise ForbesError(f"{folder.config}: {name} is {path}, which is not there. Set it to where the data are")
     try:
         built = parser.instantiate(parsed)
     except ValueError as error:

@@ -25,17 +25,27 @@ class RunFolder:
         metrics.jsonl      one JSON object a line: {"update": n, "epoch": e, name: value, ...}
         checkpoints/       last.ckpt
         figures/
+        evaluation.json    and evaluation.npz, what `forbes evaluate` has measured
+        evaluation-best/   the same of another checkpoint, here checkpoints/best.ckpt
+
+    In config.yaml the `path` of the data is absolute, so that a run can be resumed and measured from any folder. The
+    run folder itself may be moved, copied or read-only.
 
     Args:
-        path: the folder; it need not exist yet.
+        path: the folder; it need not exist yet. Or one of its checkpoints, `RUN/checkpoints/best.ckpt`, to read it
+            instead of the last one.
     """
 
     def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
+        path = Path(path)
+        chosen = path if path.suffix == ".ckpt" else None
+        self.path = path if chosen is None else path.parent.parent
         self.config = self.path / "config.yaml"
         self.provenance = self.path / "provenance.json"
         self.metrics = self.path / "metrics.jsonl"
-        self.checkpoint = self.path / "checkpoints" / "last.ckpt"
+        last = self.path / "checkpoints" / "last.ckpt"
+        self.checkpoint = chosen or last
+        self.results = self.path if self.checkpoint == last else self.path / f"evaluation-{self.checkpoint.stem}"
         self.figures = self.path / "figures"
 
     def __str__(self) -> str:
@@ -67,6 +77,9 @@ class RunFolder:
             raise ForbesError(f"{run}: no such run folder. `forbes fit` makes one, under runs/")
         if not run.config.is_file():
             raise ForbesError(f"{run}: not a run folder, config.yaml is missing. Name a folder that `forbes fit` made")
+        if run.results != run.path and not run.checkpoint.is_file():
+            there = sorted(path.name for path in run.checkpoint.parent.glob("*.ckpt"))
+            raise ForbesError(f"{run.checkpoint}: no such checkpoint. There are {', '.join(there) or 'none'}")
         if not run.checkpoint.is_file():
             raise ForbesError(f"{run}: has no checkpoint yet. Train it: forbes fit --config {run.config}")
         return run

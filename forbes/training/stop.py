@@ -43,7 +43,8 @@ class StopOnSignal(Callback):
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         """End the loop after this update, unless a validation follows, which must not be left half done."""
-        if not trainer.is_last_batch and not self._whole_epochs:
+        updates = (batch_idx + 1) % trainer.accumulate_grad_batches == 0  # a checkpoint has no half-summed gradients
+        if updates and not trainer.is_last_batch and not self._whole_epochs:
             self._end()
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

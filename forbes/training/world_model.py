@@ -20,7 +20,7 @@ from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, Decoder
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
 
-__all__ = ["Group", "Objective", "WorldModel", "follow_rates", "require_at_least", "together"]
+__all__ = ["Group", "Objective", "WorldModel", "batches_before", "follow_rates", "require_at_least", "together"]
 
 
 class Group(NamedTuple):
@@ -135,11 +135,12 @@ class WorldModel(LightningModule):
         return self.model.elbo(batch.observation, batch.action, batch.mask, self.kl)
 
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
-        """Seed the noise of this update, so that a resumed run draws the same; check an epoch's first observations."""
+        """Seed the noise of this batch, so that a resumed run draws the same; check an epoch's first observations."""
         if batch_idx == 0:
             self.model.likelihood.check(batch.observation)
-        torch.manual_seed(derive_seed(self.seed, "update", self.global_step))
-        if self.model.center is not None and self.global_step == 0:
+        number = batches_before(self)
+        torch.manual_seed(derive_seed(self.seed, "update", number))
+        if self.model.center is not None and number == 0:
             self.model.center.copy_(self.model.likelihood.target(batch.observation)[batch.mask].mean(0))  # (*O)
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
@@ -235,6 +236,12 @@ def together(found: Sequence[tuple[Tensor, dict[str, Tensor]]]) -> tuple[Tensor,
     (first, _), *others = found
     loss = sum((loss for loss, _ in others), first)
     return loss, {name: value for _, values in found for name, value in values.items()}
+
+
+def batches_before(module: LightningModule) -> int:
+    """Return how many training batches came before the one at hand; they are updates unless gradients accumulate."""
+    trainer = module._trainer
+    return 0 if trainer is None else trainer.fit_loop.total_batch_idx
 
 
 def follow_rates(module: LightningModule, rates: Sequence[float]) -> None:

@@ -79,13 +79,19 @@ def test_a_pass_shows_no_sequence_twice_and_the_next_is_in_another_order():
     assert torch.cat(passes).unique().tolist() == list(range(23))
 
 
-def test_an_epoch_goes_on_from_the_trainers_update():
+def trainer_after(batches, of_this_epoch=0, overfit_batches=0.0):
+    """A trainer that has taken so many training batches; its loop has the index of the last."""
+    loop = SimpleNamespace(total_batch_idx=batches - 1, batch_idx=of_this_epoch - 1)
+    return SimpleNamespace(fit_loop=loop, overfit_batches=overfit_batches)
+
+
+def test_an_epoch_goes_on_from_the_batches_that_the_trainer_has_taken():
     data = module()
     whole = [data.train_index(update).tolist() for update in range(18)]
 
     epochs = []
-    for update in (0, 6, 9):
-        data.trainer = SimpleNamespace(global_step=update)
+    for batches in (0, 6, 9):
+        data.trainer = trainer_after(batches)
         loader = data.train_dataloader()
         assert len(loader) == 6
         epochs.append(indices(loader))
@@ -93,13 +99,25 @@ def test_an_epoch_goes_on_from_the_trainers_update():
     assert epochs == [whole[:6], whole[6:12], whole[9:15]]
 
 
-def test_the_trainers_update_is_read_when_an_epoch_begins():
+def test_overfitting_takes_the_same_batches_in_every_epoch():
     data = module()
-    data.trainer = SimpleNamespace(global_step=0)
+    whole = [data.train_index(update).tolist() for update in range(12)]
+
+    epochs = []
+    for batches, of_this_epoch in ((0, 0), (6, 0), (8, 2)):
+        data.trainer = trainer_after(batches, of_this_epoch, overfit_batches=2)
+        epochs.append(indices(data.train_dataloader()))
+
+    assert epochs == [whole[:6], whole[:6], whole[2:8]]
+
+
+def test_the_trainers_batches_are_counted_when_an_epoch_begins():
+    data = module()
+    data.trainer = trainer_after(0)
     loader = data.train_dataloader()
 
     first = indices(loader)
-    data.trainer.global_step = 6
+    data.trainer = trainer_after(6)
 
     assert indices(loader) == [data.train_index(update).tolist() for update in range(6, 12)]
     assert first == [data.train_index(update).tolist() for update in range(6)]

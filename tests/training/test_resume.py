@@ -40,6 +40,48 @@ def test_two_epochs_and_two_more_are_four_epochs(straight, tiny_run, tmp_path):
     assert_same_run(run, straight)
 
 
+@pytest.mark.parametrize(
+    "limits",
+    [
+        [("--trainer.max_steps", "8"), ("--trainer.max_steps", "-1")],
+        [("--trainer.max_steps", "8"), ("--trainer.max_steps", "20")],
+        [("--trainer.max_steps", "5"), ("--trainer.max_steps", "20")],  # the end of an epoch
+        [("--trainer.max_steps", "8"), ("--trainer.max_steps", "10"), ("--trainer.max_steps", "20")],
+        [("--trainer.max_steps", "5"), ("--trainer.max_steps", "6"), ("--trainer.max_steps", "-1")],
+    ],
+    ids=lambda limits: " then ".join(value for _, value in limits),
+)
+def test_a_limit_that_is_raised_is_no_limit(straight, tiny_config, tmp_path, limits):
+    run = str(tmp_path / "run")
+    first, *rest = limits
+    assert main(["fit", "--config", str(tiny_config), *FOUR_EPOCHS, "--run_dir", run, *first]) == 0
+    assert read_checkpoint(RunFolder(run).checkpoint)["global_step"] == int(first[1])
+
+    for limit in rest:
+        assert main(["fit", "--resume", run, *limit]) == 0
+
+    assert_same_run(run, straight)
+
+
+def test_a_limit_within_the_last_epoch_leaves_its_rest_to_train(tiny_run, tiny_config, tmp_path):
+    run = str(tmp_path / "run")
+
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", run, "--trainer.max_steps", "7"]) == 0
+    assert main(["fit", "--resume", run, "--trainer.max_steps", "10"]) == 0
+
+    assert_same_run(run, tiny_run)
+
+
+def test_a_finished_run_says_so(tiny_run, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(tiny_run, run)
+
+    assert main(["fit", "--resume", str(run)]) == 0
+
+    assert "nothing was trained: max_epochs 2 ends it at update 10. Give a higher limit" in capsys.readouterr().out
+    assert_same_run(run, tiny_run)
+
+
 @pytest.mark.parametrize("schedule", ["constant", "cosine"])
 def test_updates_after_the_last_checkpoint_are_made_again(tiny_config, tmp_path, monkeypatch, schedule):
     """What SIGKILL leaves: metrics that are ahead of the checkpoint."""
@@ -96,6 +138,24 @@ def test_a_signal_stops_a_training_where_it_can_go_on(
     assert read_checkpoint(RunFolder(run).checkpoint)["global_step"] == stops_at
     assert f"stopped at update {stops_at}, go on with: forbes fit --resume {run}" in capsys.readouterr().out
     assert main(["fit", "--resume", run]) == 0
+    assert_same_run(run, straight)
+
+
+def test_a_signal_does_not_part_the_batches_of_an_update(tiny_config, tmp_path, monkeypatch):
+    fit = ["fit", "--config", str(tiny_config), "--trainer.accumulate_grad_batches", "2", "--run_dir"]
+    straight, run = str(tmp_path / "straight"), str(tmp_path / "run")
+    assert main([*fit, straight]) == 0
+
+    def interrupt(self, loss):
+        if self.trainer.fit_loop.total_batch_idx == 6:  # the last of an update; the next is the first of one
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(WorldModel, "on_before_backward", interrupt)
+        assert main([*fit, run]) == 128 + signal.SIGTERM
+    assert read_checkpoint(RunFolder(run).checkpoint)["global_step"] == 5  # each epoch has three: of 2, 2 and 1 batches
+    assert main(["fit", "--resume", run]) == 0
+
     assert_same_run(run, straight)
 
 
