@@ -84,6 +84,7 @@ def _add_collect(add: Add) -> None:
     play.add_argument("--action-repeat", type=positive, help="frames for which an action is held")
     play.add_argument("--pixels", action=argparse.BooleanOptionalAction, help="observe images, or what is measured")
     play.add_argument("--size", type=positive, help="pixels a side (64)")
+    play.add_argument("--part", help="of Gymnasium: the entry of a Dict that is observed")
     play.add_argument("--camera", type=int, help="number of the camera")
     play.add_argument("--fast", action="store_const", const=True, help="no shadows: other pixels")
     play.add_argument("--timeout", type=float, help="seconds for an answer of the environment (60)")
