@@ -2,17 +2,16 @@
 
 from abc import ABC, abstractmethod
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from forbes.arguments import Split
 from forbes.errors import ForbesError
 from forbes.seeding import generator
 
 __all__ = ["SequenceBatch", "SequenceSource", "Split"]
-
-Split = Literal["train", "validation", "test"]
 
 
 class SequenceBatch(NamedTuple):

@@ -21,6 +21,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 import forbes.training.callbacks  # noqa: F401  so that configurations know them by their short names
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
+from forbes.parsers.fit import DESCRIPTION, run_options
 from forbes.training.checkpoint import AtomicCheckpointIO, SaveLast, read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside
 from forbes.training.configuration import add_links, add_seed, allow_modules
@@ -32,14 +33,6 @@ from forbes.training.run_folder import RunFolder, experiment_name
 from forbes.training.stop import StopOnSignal
 
 __all__ = ["fit", "predict", "test", "validate"]
-
-DESCRIPTION = {
-    "fit": "Train a model. It leaves a run folder with the configuration, metrics, checkpoint and figures.",
-    "validate": "Run the validation loop of a trained model.",
-    "test": "Run the test loop of a trained model; `forbes evaluate` measures it with care.",
-    "predict": "Run the prediction loop of a trained model.",
-}
-
 
 _NOT_OURS = (  # warnings that say nothing true or useful here
     ".*does not have many workers.*",  # a batch is gathered in less time than a worker needs to hand it over
@@ -106,7 +99,7 @@ class _Experiment(LightningCLI):
 
     def __init__(self, command: str, arguments: Sequence[str], stack: ExitStack) -> None:
         self.command, self.arguments, self.stack = command, arguments, stack
-        options = _run_options()
+        options = run_options()
         self.options, rest = options.parse_known_args(arguments if command == "fit" else [])
         self.resumed = RunFolder.trained(self.options.resume) if self.options.resume else None
         if command != "fit":
@@ -215,17 +208,3 @@ class _Experiment(LightningCLI):
 def _as_list(value: Any) -> list[Any]:
     """Give what a configuration holds as one thing, several, or none."""
     return [] if value is None else list(value) if isinstance(value, list) else [value]
-
-
-def _run_options() -> argparse.ArgumentParser:
-    """Give the options of `fit` that are not part of a configuration."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False, usage=argparse.SUPPRESS)
-    group = parser.add_argument_group(
-        "run folder, runs/EXPERIMENT/TIME-SEED/ by default"
-    ).add_mutually_exclusive_group()
-    group.add_argument("--experiment", metavar="NAME", help="instead of the configuration's name")
-    group.add_argument("--run_dir", metavar="DIR", help="the folder itself")
-    group.add_argument(
-        "--resume", metavar="RUN", help="go on with this run, from its last checkpoint with its config.yaml; flags win"
-    )
-    return parser
