@@ -320,6 +320,12 @@ def test_each_start_of_a_run_is_recorded_with_its_end(tiny_config, in_tmp_path, 
     assert read_metrics("run").index.max() == 15
 
 
+def test_short_epochs_under_a_long_logging_interval_warn_of_nothing(tiny_config, in_tmp_path, capsys):
+    assert main(["fit", "--config", str(tiny_config), "--trainer.log_every_n_steps", "50", "--run_dir", "run"]) == 0
+
+    assert "logging interval" not in capsys.readouterr().err
+
+
 def test_loggers_of_the_configuration_come_beside_ours(tiny_config, in_tmp_path):
     flags = ["--trainer.logger", "CSVLogger", "--trainer.logger.save_dir", "csv", "--run_dir", "run"]
 

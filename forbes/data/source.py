@@ -10,10 +10,12 @@ from torch import Tensor
 from forbes.arguments import Split
 from forbes.errors import ForbesError
 from forbes.seeding import generator
+from forbes.shapes import printed_by_shape
 
 __all__ = ["SequenceBatch", "SequenceSource", "Split"]
 
 
+@printed_by_shape
 class SequenceBatch(NamedTuple):
     """Sequences, batch first. Index t holds (o_t, a_{t-1}, r_t): the action that led to o_t, zero at the start."""
 

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
+from forbes.shapes import printed_by_shape
 
 __all__ = ["Environment", "Step", "check_step", "finite_bounds", "repeat", "require_repeat", "scale_action"]
 
 
+@printed_by_shape
 class Step(NamedTuple):
     """What an environment answers to an action, or to a reset."""
 

@@ -38,6 +38,7 @@ _NOT_OURS = (  # warnings that say nothing true or useful here
     ".*does not have many workers.*",  # a batch is gathered in less time than a worker needs to hand it over
     ".*dataloader is not resumable.*",  # it goes on from the trainer's update
     ".*`IterableDataset` has `__len__` defined.*",  # there are no workers
+    ".*smaller than the logging interval.*",  # the interval counts updates, whatever number of them is an epoch
     ".*treespec, LeafSpec.*",  # Lightning 2.6 calls torch 2.13 the old way
     "(?s).*JsonargparseDeprecationWarning",  # and jsonargparse 4.53
     "(?s).*instantiate_classes",
