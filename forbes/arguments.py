@@ -1,11 +1,17 @@
 """Arguments of the commands that Lightning does not parse: what is wrong with them is said in one sentence."""
 
 import argparse
-from typing import NoReturn
+from typing import Literal, NoReturn, TypeAlias
 
 from forbes.errors import ForbesError
 
-__all__ = ["ArgumentParser", "positive"]
+__all__ = ["ArgumentParser", "Dataset", "Fetched", "Origin", "Split", "positive"]
+
+Split: TypeAlias = Literal["train", "validation", "test"]
+Dataset: TypeAlias = Literal["strokes"]
+Fetched: TypeAlias = Literal["strokes", "curves"]
+Origin: TypeAlias = Literal["bundled", "dejong"]
+"""A set of strokes."""
 
 
 class ArgumentParser(argparse.ArgumentParser):

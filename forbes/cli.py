@@ -1,13 +1,16 @@
 """The command `forbes`: lists what there is, hands over to the command asked for, and prints errors as one sentence."""
 
+import argparse
 import difflib
 import importlib
+import itertools
 import sys
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from forbes import __version__
 from forbes.errors import ForbesError
+from forbes.parsers.fit import DESCRIPTION, help_page
 
 __all__ = ["main"]
 
@@ -45,7 +48,7 @@ COMMANDS = {
     ),
     "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.figures.commands:main"),
     "data": Command(
-        "fetch, build, collect and look at data", "show strokes -o strokes.png", "forbes.training.collect_command:main"
+        "fetch, build, collect and look at data", "show strokes -o strokes.png", "forbes.parsers.data:main"
     ),
     "doctor": Command("say what this machine has and lacks", "", "forbes.doctor:main"),
 }
@@ -102,9 +105,33 @@ def _run(arguments: list[str]) -> int:
         raise ForbesError(f"{arguments[0]}: no such command. {hint}")
     if modules:
         importlib.import_module("forbes.training.configuration").allow_modules(modules)
-    module, function = COMMANDS[arguments[0]].target.split(":")
+    name, *rest = arguments
+    if name in DESCRIPTION:
+        if (page := _asked_help(name, rest)) is not None:
+            print(page, end="")
+            return 0
+    else:  # help and mistakes are told before anything heavy is imported
+        _parser(name).parse_args(list(itertools.takewhile("--".__ne__, rest)))
+    module, function = COMMANDS[name].target.split(":")
     command: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
-    return command(arguments[1:]) or 0
+    return command(rest) or 0
+
+
+def _asked_help(name: str, arguments: list[str]) -> str | None:
+    """Return the help of a command that Lightning parses, if it is asked for; remove `all`, which asks Lightning."""
+    place = next((place for place, argument in enumerate(arguments) if argument in ("--help", "-h")), None)
+    if place is None:
+        return None
+    if arguments[place + 1 : place + 2] == ["all"]:
+        del arguments[place + 1]
+        return None
+    return help_page(name)
+
+
+def _parser(name: str) -> argparse.ArgumentParser:
+    """Return the parser of another command, of the module of its name."""
+    parser: argparse.ArgumentParser = importlib.import_module(f"forbes.parsers.{name}").parser()
+    return parser
 
 
 def _take_modules(arguments: list[str]) -> list[str]:

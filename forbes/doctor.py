@@ -15,12 +15,12 @@ from rich.console import Console
 from rich.table import Column, Table
 
 import forbes
-from forbes.arguments import ArgumentParser
 from forbes.data.dejong import dejong_path
 from forbes.data.digit_classifiers import classifiers_path
 from forbes.data.published import curves_path
 from forbes.data.strokes import bundled_path
 from forbes.envs.rendering import BACKENDS, probe_backend
+from forbes.parsers.doctor import parser
 
 __all__ = ["main"]
 
@@ -49,9 +49,7 @@ class Finding(NamedTuple):
 
 def main(arguments: Sequence[str]) -> int:
     """Print the report; 0 when `make fit` can work here, else 1."""
-    ArgumentParser("forbes doctor", "Say what this machine has and lacks, each lack with its remedy.").parse_args(
-        arguments
-    )
+    parser().parse_args(arguments)
     table = Table("", Column("found", overflow="fold"), Column("what to do", overflow="fold"), box=None)
     findings = [*_software(), *_hardware(), *_rendering(), *_data()]
     for finding in findings:

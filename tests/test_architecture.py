@@ -9,6 +9,7 @@ FORBES = Path(__file__).parents[1] / "forbes"
 MODULES = sorted(FORBES.rglob("*.py"))
 
 FOUNDATION = {"errors", "files", "seeding", "arguments", "deferred", "frozen", "fusion", "named", "precision"}
+FOUNDATION |= {"parsers", "shapes"}
 BENEATH = {"beliefs", "data", "envs", "models", "control", "pomdps"}  # what training knows
 MAY_IMPORT = {  # besides itself and the foundation
     **{part: set() for part in (*FOUNDATION, "beliefs", "pomdps")},
@@ -21,6 +22,7 @@ MAY_IMPORT = {  # besides itself and the foundation
     "evaluation": BENEATH | {"training"},
     "figures": BENEATH | {"training", "evaluation"},
     "doctor": {"data", "envs"},
+    "parsers": {"envs"},  # names of tasks; nothing that imports torch
     "cli": set(),
     "__main__": {"cli"},
     "__init__": set(),

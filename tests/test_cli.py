@@ -3,7 +3,7 @@
 import importlib.metadata
 import json
 import math
-import resource
+import re
 import shlex
 import subprocess
 import sys
@@ -15,22 +15,108 @@ import yaml
 from forbes import __version__
 from forbes.cli import COMMANDS, main
 from forbes.data.episode_store import EpisodeStore
+from forbes.parsers.fit import help_page
 from forbes.training import WorldModel
 from forbes.training.run_folder import RunFolder, read_metrics
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
 
-def test_help_is_fast_because_it_does_not_import_torch():
-    program = "import sys, forbes.cli; forbes.cli.main(['--help']); assert 'torch' not in sys.modules"
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+HEAVY = {"torch", "lightning", "matplotlib.pyplot", "matplotlib", "pandas", "jsonargparse", "gymnasium", "dm_control"}
 
-    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime  # of the processor: it may be busy
-    assert seconds < 0.5
+
+def imported_by(*arguments):
+    """What a command prints, and which of the heavy modules it imports; it must leave by itself."""
+    program = f"""
+import sys
+from forbes.cli import main
+try:
+    main({list(arguments)!r})
+finally:
+    print(*{HEAVY!r} & sys.modules.keys(), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    *told, heavy = done.stderr.splitlines()
+    return done.stdout + "\n".join(told), heavy
+
+
+def test_help_lists_every_command_and_imports_nothing_heavy():
+    text, heavy = imported_by("--help")
+
+    assert heavy == ""
     for name in COMMANDS:
-        assert f"forbes {name}" in done.stdout
+        assert f"forbes {name}" in text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_imports_nothing_heavy(name):
+    text, heavy = imported_by(name, "--help")
+
+    assert f"usage: forbes {name}" in text
+    assert heavy == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["evaluate"], "forbes evaluate: the following arguments are required: RUN"),
+        (["compare", "a.yaml", "--seed", "x", "--", "--help"], "argument --seed: invalid int value: 'x'"),
+        (["theorem", "--steps", "0"], "0 is not a number above 0"),
+        (["data", "fetch", "digits"], "invalid choice: 'digits'"),
+    ],
+)
+def test_a_mistake_is_told_before_anything_heavy_is_imported(arguments, sentence):
+    text, heavy = imported_by(*arguments)
+
+    assert sentence in text
+    assert heavy == ""
+
+
+def test_what_follows_two_dashes_asks_for_no_help(capsys):
+    assert "absent.yaml: no such configuration" in error_of(capsys, "compare", "absent.yaml", "--", "--help")
+
+
+EXAMPLES = re.findall(r"^  forbes (fit --config .*?)(?:  +#.*)?$", help_page("fit"), re.MULTILINE)
+CHANGED = re.findall(r"(--(?:model|data|trainer|seed)[\w.]+) ([\w.-]+)", help_page("fit").split("\n\n")[3])
+
+
+def test_the_help_of_fit_is_a_screenful():
+    lines = help_page("fit").splitlines()
+
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 120
+    assert len(EXAMPLES) == 3
+    assert len(CHANGED) >= 14
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_the_examples_of_its_help_can_be_run(example, monkeypatch, capsys):
+    monkeypatch.chdir(CONFIGS.parent)
+    with pytest.raises(SystemExit) as done:
+        main([*example.split(), "--print_config"])
+
+    assert done.value.code == 0
+    assert "class_path: forbes.training.WorldModel" in capsys.readouterr().out
+
+
+def test_what_its_help_says_people_change_can_be_changed(monkeypatch, capsys):
+    monkeypatch.chdir(CONFIGS.parent)
+    flags = [f"{name}={value}" for name, value in CHANGED if value != "TASK"]
+    with pytest.raises(SystemExit) as done:
+        main(["fit", "--config", "configs/strokes/forbes.yaml", *flags, "--print_config"])
+
+    assert done.value.code == 0
+    assert "state_dim: 8" in capsys.readouterr().out
+
+
+def test_all_flags_are_a_word_away(capsys):
+    with pytest.raises(SystemExit) as done:
+        main(["fit", "--help", "all"])
+
+    assert done.value.code == 0
+    text = capsys.readouterr().out
+    assert "--trainer.gradient_clip_val" in text
+    assert "--resume RUN" in text
 
 
 def test_the_package_and_the_script_are_the_same_program():
@@ -237,6 +323,12 @@ def test_each_start_of_a_run_is_recorded_with_its_end(tiny_config, in_tmp_path, 
     assert [start["exit_status"] for start in starts] == [0, 1, 0]
     assert starts[1]["command"] == "forbes fit --resume run --trainer.max_epochs 3"
     assert read_metrics("run").index.max() == 15
+
+
+def test_short_epochs_under_a_long_logging_interval_warn_of_nothing(tiny_config, in_tmp_path, capsys):
+    assert main(["fit", "--config", str(tiny_config), "--trainer.log_every_n_steps", "50", "--run_dir", "run"]) == 0
+
+    assert "logging interval" not in capsys.readouterr().err
 
 
 def test_loggers_of_the_configuration_come_beside_ours(tiny_config, in_tmp_path):

@@ -9,10 +9,12 @@ from torch.nn.functional import softplus
 
 from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.deferred import Loop
+from forbes.shapes import printed_by_shape
 
 __all__ = ["Mixture", "MixtureBelief"]
 
 
+@printed_by_shape
 class Mixture(NamedTuple):
     """M diagonal Gaussians."""
 

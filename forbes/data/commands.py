@@ -1,10 +1,9 @@
 """`forbes data …`: build, fetch, compare, collect and look at the data."""
 
-import argparse
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -13,26 +12,21 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.progress import track
 
+from forbes.arguments import Dataset, Fetched, Origin, Split
 from forbes.data.classifier_training import classify, digits_of, quality, train_classifiers
 from forbes.data.dejong import dejong_path, verify_dejong
 from forbes.data.digit_classifiers import CLASSIFIERS_SHA256, classifiers_path, save_weights
 from forbes.data.download import git_blob_id
-from forbes.data.episode_commands import Add, add_episode_commands
 from forbes.data.fetch import fetch_dejong
 from forbes.data.pictures import save_picture
 from forbes.data.published import CURVES_BLOB, curves_path, fetch_curves
-from forbes.data.source import Split
 from forbes.data.stroke_comparison import compare_sets
 from forbes.data.stroke_extraction import extract_strokes, read_mnist
 from forbes.data.stroke_file import SIDE, load_strokes, save_strokes
 from forbes.data.strokes import Strokes, bundled_path
 from forbes.errors import ForbesError
 
-__all__ = ["build_classifiers", "build_strokes", "compare_strokes", "fetch", "main", "show"]
-
-Dataset = Literal["strokes"]
-Fetched = Literal["strokes", "curves"]
-Origin = Literal["bundled", "dejong"]
+__all__ = ["build_classifiers", "build_strokes", "compare_strokes", "fetch", "show"]
 
 _FRAMES = 6
 _PREFIXES = (5, 10, 15)  # points of the beginnings for which classifiers are measured
@@ -166,62 +160,3 @@ def _draw_digit(row: Sequence[Axes], points: NDArray[np.int_], pen_up: NDArray[n
     row[-1].set_title("strokes, green to red", fontsize=8)
     for axis in row:
         axis.set(xlim=(-0.5, SIDE - 0.5), ylim=(SIDE - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
-
-
-def main(argv: list[str], *more: Callable[[Add], None]) -> int | None:
-    """Run `forbes data …`; 1 where `check` has found damage.
-
-    Args:
-        argv: What follows `forbes data` on the command line.
-        more: Each adds commands of who knows more than the data.
-    """
-    arguments = vars(_parser(more).parse_args(argv))
-    command = arguments.pop("command")
-    status: int | None = command(**arguments)
-    return status
-
-
-def _parser(more: Sequence[Callable[[Add], None]]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="forbes data",
-        description="Build, fetch, compare, collect and look at the data.",
-        epilog="examples:",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def add(name: str, function: Callable[..., Any], example: str) -> argparse.ArgumentParser:
-        summary = (function.__doc__ or "").partition("\n")[0]
-        command = commands.add_parser(name, help=summary, description=summary, epilog=f"example: forbes data {example}")
-        command.set_defaults(command=function)
-        parser.epilog = f"{parser.epilog}\n  forbes data {example}"
-        return command
-
-    build = add("build-strokes", build_strokes, "build-strokes --images package/data")
-    build.add_argument("--images", type=Path, required=True, help="folder with the four IDX files of MNIST, unpacked")
-    build.add_argument("-o", "--output", type=Path, help="file to write, by default the bundled one")
-
-    train = add("build-classifiers", build_classifiers, "build-classifiers -o classifiers.npz")
-    train.add_argument("-o", "--output", type=Path, help="file to write, by default the bundled one")
-
-    get = add("fetch", fetch, "fetch strokes --from sequences.tar.gz")
-    get.add_argument("dataset", choices=get_args(Fetched), help="strokes of the paper, or Dreamer's learning curves")
-    of_strokes = "of strokes the tarball, its extracted folder or an .npz"
-    get.add_argument("--from", dest="from_", type=Path, metavar="PATH", help=f"a local copy; {of_strokes}")
-
-    compare = add("compare-strokes", compare_strokes, "compare-strokes data/strokes.npz dejong-strokes.npz")
-    compare.add_argument("one", type=Path, help="a stroke file")
-    compare.add_argument("other", type=Path, help="another one, of the same digits")
-    compare.add_argument("--split", choices=("train", "test"), default="test", help="digits to compare")
-
-    look = add("show", show, "show strokes --split test --index 0 1 2 -o strokes.png")
-    look.add_argument("dataset", choices=get_args(Dataset))
-    look.add_argument("--split", choices=get_args(Split), default="test", help="split of the digits")
-    look.add_argument("--index", type=int, nargs="+", default=[0, 1, 2], help="numbers of the digits in their split")
-    look.add_argument("-o", "--output", type=Path, default=Path("strokes.png"), help="picture to write")
-    look.add_argument("--origin", choices=get_args(Origin), default="bundled", help="set of strokes")
-    look.add_argument("--path", type=Path, help="read this stroke file instead of the origin's own")
-
-    for add_commands in (*more, add_episode_commands):
-        add_commands(add)
-    return parser

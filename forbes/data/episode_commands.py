@@ -1,10 +1,8 @@
 """`forbes data info` and `check`: the episodes of an environment, counted and verified."""
 
-import argparse
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +10,7 @@ from forbes.data.episode_store import EpisodeStore, EpisodeWriter
 from forbes.data.episodes import EpisodeRecord
 from forbes.data.pictures import MAX_CHANNELS, draw_strips, save_picture
 
-__all__ = ["Add", "add_episode_commands", "check", "count_steps", "info"]
-
-Add: TypeAlias = Callable[[str, Callable[..., Any], str], argparse.ArgumentParser]
-"""Adds a command to `forbes data`: its name, its function and an example."""
+__all__ = ["check", "count_steps", "info"]
 
 
 def info(path: Path, output: Path | None = None) -> None:
@@ -96,13 +91,3 @@ def count_steps(records: list[EpisodeRecord]) -> str:
 
 def _spread(values: Any) -> str:
     return f"{values.min():.3f} to {values.max():.3f}, mean {values.mean():.3f}"
-
-
-def add_episode_commands(add: Add) -> None:
-    """Add the commands to those of `forbes data`."""
-    look = add("info", info, "info episodes/cartpole")
-    look.add_argument("path", type=Path, metavar="DIR", help="folder of the episodes")
-    look.add_argument("-o", "--output", type=Path, help="picture to write, by default DIR/frames.png")
-
-    verify = add("check", check, "check episodes/cartpole")
-    verify.add_argument("path", type=Path, metavar="DIR", help="folder of the episodes")

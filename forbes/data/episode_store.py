@@ -22,7 +22,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
-from forbes.data.episodes import DamagedEpisodeError, Episode, EpisodeRecord, map_episode, pack_episode, problem_of
+from forbes.data.episodes import (
+    DamagedEpisodeError,
+    Episode,
+    EpisodeRecord,
+    map_episode,
+    pack_episode,
+    problem_of,
+    problem_with,
+)
 from forbes.errors import ForbesError
 from forbes.files import fsync_folder, locked, replace_file
 
@@ -151,13 +159,13 @@ class EpisodeWriter(EpisodeStore):
             episode: whole, from its first observation to its last.
             seed: that the environment was reset with.
             policy: that acted.
-            environment: task, shapes and settings, plain values.
+            environment: what `describe_environment` gives: task, shapes and settings, plain values.
 
         Raises:
             ForbesError: where the episode is not whole, is of another environment, or cannot be written.
         """
         number = self.watermark
-        about = {
+        about: dict[str, Any] = {
             "number": number,
             "steps": len(episode.reward) - 1,
             "frames": episode.frames,
@@ -167,7 +175,7 @@ class EpisodeWriter(EpisodeStore):
             "policy": policy,
             "environment": json.loads(json.dumps(environment)),
         }
-        if problem := problem_of(episode):
+        if problem := problem_of(episode) or problem_with(about["environment"], episode):
             raise ForbesError(f"{self.file(number)}: not stored, {problem}. Mend the environment or the policy")
         content = pack_episode(episode, about)
         record = EpisodeRecord(**about, size=len(content), sha256=hashlib.sha256(content).hexdigest())

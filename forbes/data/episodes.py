@@ -18,13 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
+from forbes.shapes import printed_by_shape
 
-__all__ = ["DamagedEpisodeError", "Episode", "EpisodeRecord", "map_episode", "pack_episode", "problem_of"]
+__all__ = ["DamagedEpisodeError", "Episode", "EpisodeRecord", "map_episode", "missing_in", "pack_episode"]
+__all__ += ["problem_of", "problem_with"]
 
 _ARRAYS = ("observation", "action", "reward")
 _LOCAL_HEADER = 30  # bytes before the name of a member of a zip archive
 
 
+@printed_by_shape
 class Episode(NamedTuple):
     """T actions and T + 1 observations. Index t holds (o_t, a_{t-1}, r_t): the action that led there, 0 at the start.
 
@@ -102,6 +105,23 @@ def problem_of(episode: Episode) -> str:
             return f"its {name} is not finite at step {np.argwhere(~np.isfinite(array))[0, 0]}"
     if episode.action[0].any() or episode.reward[0] != 0:
         return "its first action or reward is not zero, expected at index t the action that led to the observation"
+    return ""
+
+
+def missing_in(environment: dict[str, Any]) -> str:
+    """Name what a record does not say of its environment, and who draws from the episodes must know; or return ""."""
+    needed = ("task", "observation_shape", "action_dim", "discrete")
+    return next((name for name in needed if name not in environment), "")
+
+
+def problem_with(environment: dict[str, Any], episode: Episode) -> str:
+    """Say what is wrong with what is recorded of an episode's environment; empty where nothing is."""
+    if name := missing_in(environment):
+        return f"its environment has no {name}, expected what `describe_environment` gives"
+    arrays = {"observation_shape": list(episode.observation.shape[1:]), "action_dim": episode.action.shape[1]}
+    for name, found in arrays.items():
+        if environment[name] != found:
+            return f"its environment's {name} is {environment[name]}, that of its arrays {found}"
     return ""
 
 

@@ -11,10 +11,12 @@ from forbes.errors import ForbesError
 from forbes.pomdps import Process, Trajectories
 from forbes.pomdps.hmm import FiniteProcess
 from forbes.seeding import generator
+from forbes.shapes import printed_by_shape
 
 __all__ = ["Simulated", "SimulatedSequences"]
 
 
+@printed_by_shape
 class SimulatedSequences(NamedTuple):
     """Some sequences in full."""
 

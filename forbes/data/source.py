@@ -2,20 +2,21 @@
 
 from abc import ABC, abstractmethod
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from forbes.arguments import Split
 from forbes.errors import ForbesError
 from forbes.named import Named
 from forbes.seeding import generator
+from forbes.shapes import printed_by_shape
 
 __all__ = ["SequenceBatch", "SequenceSource", "Split"]
 
-Split = Literal["train", "validation", "test"]
 
-
+@printed_by_shape
 class SequenceBatch(NamedTuple):
     """Sequences, batch first. Index t holds (o_t, a_{t-1}, r_t): the action that led to o_t, zero at the start."""
 

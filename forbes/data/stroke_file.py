@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
 from forbes.files import npz_bytes, replace_file
+from forbes.shapes import printed_by_shape
 
 __all__ = ["SIDE", "StrokeArrays", "check_strokes", "load_strokes", "save_strokes", "sha256_of_arrays"]
 
@@ -32,6 +33,7 @@ SIDE = 28
 _MEMBER_LIMIT = 64 * 2**20  # bytes of one array; the largest of the two known sets has 5 MB
 
 
+@printed_by_shape
 class StrokeArrays(NamedTuple):
     """The pen paths of one split's digits."""
 

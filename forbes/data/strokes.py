@@ -12,10 +12,12 @@ from forbes.data.dejong import dejong_path, verify_dejong
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.stroke_file import SIDE, StrokeArrays, load_strokes, sha256_of_arrays
 from forbes.errors import ForbesError
+from forbes.shapes import printed_by_shape
 
 __all__ = ["StrokePoints", "Strokes", "bundled_path"]
 
 
+@printed_by_shape
 class StrokePoints(NamedTuple):
     """The pen paths of some digits, the compact form of their frames."""
 

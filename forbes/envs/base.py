@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
+from forbes.shapes import printed_by_shape
 
-__all__ = ["Environment", "Step", "check_step", "repeat", "require_repeat", "scale_action"]
+__all__ = ["Environment", "Step", "check_step", "finite_bounds", "repeat", "require_repeat", "scale_action"]
 
 
+@printed_by_shape
 class Step(NamedTuple):
     """What an environment answers to an action, or to a reset."""
 
@@ -77,12 +79,19 @@ def require_repeat(where: str, action_repeat: int) -> None:
         raise ForbesError(f"{where}: action_repeat is {action_repeat}, expected at least 1. Choose another")
 
 
+def finite_bounds(low: NDArray[Any], high: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the bounds with each infinite one 2 away from the finite one, or -1 and 1 where both are infinite."""
+    below, above = np.isfinite(low), np.isfinite(high)
+    return (
+        np.where(below, low, np.where(above, high - 2.0, -1.0)),
+        np.where(above, high, np.where(below, low + 2.0, 1.0)),
+    )
+
+
 def scale_action(action: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> NDArray[np.float64]:
-    r"""Map [-1, 1] to the bounds :math:`l + (a + 1)(h - l) / 2`; where one of them is infinite, leave it as it is."""
-    bounded = np.isfinite(low) & np.isfinite(high)
-    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
-    scaled: NDArray[np.float64] = low + (action + 1.0) * (high - low) / 2
-    return scaled
+    r"""Map [-1, 1] to the bounds :math:`l + (a + 1)(h - l) / 2`, infinite ones as in `finite_bounds`: scale 1."""
+    low, high = finite_bounds(low, high)
+    return low + (action + 1.0) * (high - low) / 2
 
 
 def check_step(step: Step, shape: tuple[int, ...]) -> None:

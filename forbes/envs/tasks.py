@@ -22,7 +22,8 @@ _HORIZONS = {"mountain_hike": 75, "multi_start_hike": 75, "t_maze": 30, "tiger":
 
 TASKS = f"""\
 {", ".join(_HORIZONS)}: processes with an exact belief
-{_GYMNASIUM}ID: any environment of Gymnasium
+{_GYMNASIUM}ID: any environment of Gymnasium; of a package that registers its own, with the package's name:
+  {_GYMNASIUM}minigrid:MiniGrid-Empty-5x5-v0
 CLASS: an Environment of your own, of a module named by --allow-module
 anything else is a task of the DeepMind Control Suite, domain_task: cartpole_swingup, ball_in_cup_catch, walker_walk"""
 

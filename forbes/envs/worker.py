@@ -5,13 +5,17 @@ on a GPU can hang it. Numbers travel as numpy, and torch is not imported there u
 """
 
 import atexit
+import io
 import multiprocessing
 import os
+import pickle
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from types import FunctionType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -25,6 +29,9 @@ __all__ = ["BrokenEnvironmentError", "EnvironmentProcess", "belong_to_parent"]
 START_LIMIT = 180.0
 """Seconds to import and build an environment; two tries of a renderer, of 60 each, among them."""
 _UNGUARDED = '. It reads the script that started it anew: keep its commands under `if __name__ == "__main__":`'
+
+
+_IN_A_MODULE = "Define it at the top of a module file, and import it from there"
 
 
 class BrokenEnvironmentError(ForbesError):
@@ -61,10 +68,11 @@ class EnvironmentProcess(Environment):
 
     Raises:
         BrokenEnvironmentError: where the environment cannot be built.
-        ForbesError: where it says why, in a sentence.
+        ForbesError: where it says why, in a sentence, or another process cannot import what makes it.
     """
 
     def __init__(self, make: Callable[[], Environment], timeout: float = 60.0) -> None:
+        _require_importable(make)
         self.make, self._timeout = make, timeout
         self._process: multiprocessing.process.BaseProcess | None = None
         self._start()
@@ -151,6 +159,34 @@ class EnvironmentProcess(Environment):
             raised.add_note(answer.details)
             raise raised
         return answer
+
+
+class _Importable(pickle.Pickler):
+    """Finds what another process could not import: the classes and functions of a `__main__` without a file."""
+
+    def reducer_override(self, value: Any) -> Any:
+        """Raise a ForbesError for one of them; leave all else to pickle."""
+        if isinstance(value, type | FunctionType) and value.__module__ == "__main__":
+            raise ForbesError(
+                f"{value.__qualname__}: it is defined in a notebook or on standard input, which the process of an "
+                f"environment cannot import. {_IN_A_MODULE}"
+            )
+        return NotImplemented
+
+
+def _require_importable(make: Callable[[], Environment]) -> None:
+    """Raise a ForbesError where what makes an environment cannot be sent to another process."""
+    name = getattr(make, "__qualname__", type(make).__name__)
+    file = getattr(sys.modules["__main__"], "__file__", "")
+    try:
+        (pickle.Pickler if os.path.isfile(file) else _Importable)(io.BytesIO()).dump(make)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:  # all three are what pickle raises
+        raise ForbesError(f"{name}: it cannot be sent to another process ({error}). {_IN_A_MODULE}") from error
+    if file and not os.path.isfile(file):  # "<stdin>", which a spawned process takes for a file
+        raise ForbesError(
+            f"{name}: commands on standard input cannot start the process of an environment, which reads them again. "
+            "Write them to a file"
+        )
 
 
 def _serve(connection: Connection, make: Callable[[], Environment]) -> None:

@@ -13,7 +13,6 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
-from forbes.arguments import ArgumentParser, positive
 from forbes.data import Experience
 from forbes.data.collection import describe_environment
 from forbes.data.episodes import Episode
@@ -32,7 +31,7 @@ from forbes.training.loading import load_run, loaded_agent
 from forbes.training.provenance import commit
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["add_acting_samples", "evaluate_agents", "is_agent", "play_test_episode"]
+__all__ = ["evaluate_agents", "is_agent", "play_test_episode"]
 
 _DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
 _REWARD = "reward_uncertainty"
@@ -153,16 +152,6 @@ def _record(one: _Played, folder: Path, seed: int, command: str) -> None:
 def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int) -> Episode:
     """Play an episode of a test, which was not in the training: for every agent, the same seed is the same episode."""
     return play_measured(agent, environment, "test episode", seed, number)
-
-
-def add_acting_samples(parser: ArgumentParser) -> None:
-    """Add what says how an agent acts on its belief."""
-    parser.add_argument(
-        "--acting-samples",
-        type=positive,
-        metavar="K",
-        help="trajectories of its belief whose mean action an agent takes (default: as it was trained, 1 in the paper)",
-    )
 
 
 def _counted(run: str, episodes: int) -> Iterator[int]:

@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import torch
 from rich.console import Console
@@ -12,8 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
-from forbes.arguments import ArgumentParser, positive
-from forbes.data import SequenceBatch, SequenceDataModule, Split
+from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.evaluation.belief_errors import ERRORS, Belief, belief_errors, mode_centres, moment_matched
 from forbes.evaluation.bounds import Increments
@@ -22,6 +21,7 @@ from forbes.evaluation.progress import with_progress
 from forbes.evaluation.record import describe, read_record, write_record
 from forbes.evaluation.runs import data_name, data_sha256, split_batches
 from forbes.evaluation.scoring import Scores, require_finite
+from forbes.parsers.beliefs import parser
 from forbes.pomdps import ExactFilter
 from forbes.seeding import derive_seed, generator
 from forbes.training import KnownBelief
@@ -31,29 +31,6 @@ from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
-
-_DESCRIPTION = """\
-Measure how far learned beliefs of a known process are from its exact one.
-
-  forbes fit --config configs/pomdp/mirror_sensor/known_mixture.yaml --run_dir runs/mixture
-  forbes beliefs runs/mixture
-
-Per step, mean and standard error over sequences:
-
-  forward_kl        KL(exact || q) in nats: large where q misses a mode
-  reverse_kl        KL(q || exact) in nats: large where q has mass that should not be there
-  state_nll_regret  log exact(s_t) - log q(s_t) of the true state in nats; its mean is the forward KL
-  variance_ratio    tr Var q / tr Var exact: below 1 where q is too certain
-  mode_mass_error   half the sum over modes of |q - exact|, where the process can have several
-  elbo_gap          (log p(o_1..T) - ELBO) / T in nats, where the process has all densities; a smaller gap is not a
-                    better belief
-
-A KL is infinite where one belief has mass and the other has none, as an exact belief of bounded support; such a column
-gives the share of sequences in which it is, instead of a mean, and the record has it as "infinite".
-
-Below the runs stands the diagonal Gaussian of the exact belief's mean and variance: by the forward KL, the best of its
-family. Where the exact belief is a grid, sums over its cells, elsewhere S samples of both. Writes evaluation.json, and
-evaluation.npz with each sequence's numbers, into each run folder."""
 
 _ROWS = 10  # sequences at a time: on a fine grid half a million cells
 
@@ -68,7 +45,7 @@ class _Run(NamedTuple):
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
-    args = _parser().parse_args(argv)
+    args = parser().parse_args(argv)
     runs = [_load(path) for path in args.runs]
     sha256 = _same_data(runs, args)
     table = _table(args)
@@ -90,16 +67,6 @@ def main(argv: Sequence[str]) -> None:
         table.add_row(*_row(run.path, f"{type(run.module.model.head).__name__}, {run.module.objective}", scores))
     table.add_row(*_row("", "moment-matched Gaussian", _matched(runs[0], args)))
     Console(width=None if sys.stdout.isatty() else 200).print(table)
-
-
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser("forbes beliefs", _DESCRIPTION)
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made of a KnownBelief")
-    parser.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
-    parser.add_argument("--sequences", type=positive, default=200, help="the first so many (default: 200)")
-    parser.add_argument("--samples", type=positive, default=100, help="S of beliefs and ELBO (default: 100)")
-    parser.add_argument("--seed", type=int, default=0, help="of the samples (default: 0)")
-    return parser
 
 
 def _load(path: str) -> _Run:

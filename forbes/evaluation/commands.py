@@ -1,20 +1,19 @@
 """`forbes evaluate`: bounds and proper scores of trained models, and the paired difference of each two."""
 
-import argparse
 import itertools
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from forbes.arguments import ArgumentParser, positive
-from forbes.data import Simulated, Split
+from forbes.arguments import Split
+from forbes.data import Simulated
 from forbes.errors import ForbesError
-from forbes.evaluation.agents import add_acting_samples, evaluate_agents, is_agent
+from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.measured import SCORES, Measured, note, pair
 from forbes.evaluation.progress import with_progress
@@ -30,55 +29,13 @@ from forbes.evaluation.runs import (
     require_comparable,
     split_batches,
 )
-from forbes.evaluation.scoring import PASSES, Parts, Pass, exact_pass, make_pass, score_split
+from forbes.evaluation.scoring import Parts, Pass, exact_pass, make_pass, score_split
 from forbes.evaluation.tables import print_degradation, print_pairs, print_references, print_runs
+from forbes.parsers.evaluate import PASSES, SUBSET, parser
 from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["add_score_options", "evaluate", "main", "wanted_metrics"]
-
-_SUBSET = 1000  # sequences that particles are spent on, unless --digits says otherwise
-
-_DESCRIPTION = f"""\
-Measure trained models by bounds and proper scores, and compare them on the same sequences.
-
-  forbes evaluate runs/compare/forbes-0 runs/compare/rssm-0
-  forbes evaluate runs/compare/forbes-0 --scores elbo pll --sequences 200
-  forbes evaluate runs/agent/forbes-0 runs/agent/dreamer-0 --episodes 20
-
-Nats per sequence of observations, fully normalised, without free nats; the KL is the Monte-Carlo estimate for every
-family; mean and standard error over sequences. An ELBO alone does not tell a good belief: it prefers one that is too
-certain. So beside it:
-
-  elbo       the bound and its parts, S trajectories, on the whole split
-  pll        log p(o_t | o_1..t-1) summed over t, by K particles of the belief: the proper score of the filtering
-             belief; and the IWAE bound, by the same trajectories
-  fivo       the sequential Monte-Carlo bound, by K particles, and their effective sample size
-  open-loop  log p(rest | beginning), by K futures that start in the belief; with pll, the degradation: how much a
-             prediction loses with each step that it has not seen
-
-Data of a known process add log_p, the exact log p(o_1..T), which no bound exceeds. A VectorModel has no bounds, since
-its likelihood is exact, and pll gives it; pll and open-loop of a ParticleModel are those of its own sets of particles.
-
-pll, fivo and open-loop take the first {_SUBSET} sequences, and their names say so. Writes evaluation.json, and
-evaluation.npz with each sequence's scores, into each run folder. Interrupted, the same command goes on where it
-stopped.
-
-Agents play --episodes without exploration, the same ones for all, whatever each is shown; their score is the return.
-Beside it stands what share of the rewards' variance in these episodes the world model foretells, from its belief and 1,
-5 and 15 steps ahead by the actions taken: 1 is perfect, 0 no better than the mean reward, as of a model that knows its
-own episodes by heart, or where rewards hardly vary; then how far prior and posterior are from the nearest Gaussian, 0
-where the family makes no difference; and, of a process whose exact belief is known, how unsure the agent's belief is of
-the reward, as a share of the exact one's variance: near 0 where its draws all say the same. All is kept as each agent
-ends; interrupted, all play again.
-
-With --acting-samples 32 an agent takes the mean action of 32 trajectories of its belief (of discrete actions the
-commonest), not that of one, which is the paper's: no training is needed for it, and where an observation tells little
-it can be worth much, or cost as much.
-
-On digit strokes and one core, elbo takes some 4 minutes a run, pll 5, fivo 3, and open-loop 20, in proportion to
---futures and --sequences. Beside each score stands what models without a belief have on the same sequences, of
-strokes 1- to 5-grams of pen moves, of images the last frame and the mean frame; a run below one of them is marked."""
+__all__ = ["evaluate", "main", "wanted_metrics"]
 
 
 class _Job(NamedTuple):
@@ -93,7 +50,7 @@ class _Job(NamedTuple):
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
-    args = _parser().parse_args(argv)
+    args = parser().parse_args(argv)
     command = command_line("evaluate", *argv)
     if args.checkpoint is not None:
         args.runs = [str(Path(run) / "checkpoints" / args.checkpoint) for run in args.runs]
@@ -117,7 +74,7 @@ def evaluate(
 
     Args:
         paths: run folders.
-        args: with the options of `add_score_options`.
+        args: with the options of `forbes.parsers.evaluate.add_score_options`.
         command: for the record.
         folders: where the record of each run goes; into the run by default.
     """
@@ -173,42 +130,6 @@ def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[dict[str, bool
     ]
 
 
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser("forbes evaluate", _DESCRIPTION)
-    parser.add_argument(
-        "runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made, or a checkpoint in it"
-    )
-    parser.add_argument("--checkpoint", metavar="NAME", help="another than last.ckpt, in checkpoints/ of every RUN")
-    parser.add_argument("--output", metavar="DIR", help="results go to DIR/NAME-OF-RUN, not into the run folders")
-    parser.add_argument("--episodes", type=positive, default=10, help="that an agent plays (default: 10)")
-    add_acting_samples(parser)
-    add_score_options(parser)
-    return parser
-
-
-def add_score_options(parser: argparse._ActionsContainer) -> None:
-    """Add what says how runs are measured."""
-    parser.add_argument("--scores", nargs="+", choices=PASSES, default=PASSES, help="default: all")
-    parser.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
-    parser.add_argument(
-        *("--sequences", "--digits"),
-        type=_all_or_number,
-        default=None,
-        help=f"all, or only the first so many, for every score (default: all for elbo, {_SUBSET} for the others)",
-    )
-    parser.add_argument("--samples", type=positive, default=16, help="S of the ELBO (default: 16)")
-    parser.add_argument("--particles", type=positive, default=128, help="K of PLL, IWAE and FIVO (default: 128)")
-    parser.add_argument("--futures", type=positive, default=1000, help="K of the open-loop score (default: 1000)")
-    parser.add_argument("--context", type=positive, default=15, help="steps seen by the open-loop score (default: 15)")
-    parser.add_argument("--batch-size", type=positive, default=250, help="sequences at a time (default: 250)")
-    parser.add_argument("--seed", type=int, default=0, help="of the noise (default: 0)")
-    parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda, cuda:1 …")
-
-
-def _all_or_number(text: str) -> int:
-    return sys.maxsize if text == "all" else positive(text)
-
-
 def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
     """Say which passes to make, on how many sequences; refuse runs that cannot be compared there."""
     numbers = {"elbo": args.samples, "pll": args.particles, "fivo": args.particles, "open-loop": args.futures}
@@ -227,7 +148,7 @@ def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
     hashes: dict[int, list[str]] = {}
     jobs = []
     for name, score in wanted.items():
-        count = _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else _SUBSET)
+        count = _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else SUBSET)
         if count not in hashes:
             for run in runs:
                 _count(run, args, count)

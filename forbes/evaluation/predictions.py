@@ -7,10 +7,12 @@ from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Split, Strokes
 from forbes.models import BeliefModel, StateSpaceModel
+from forbes.shapes import printed_by_shape
 
 __all__ = ["Completions", "complete", "first_of_each_class", "open_loop", "whole_sequences"]
 
 
+@printed_by_shape
 class Completions(NamedTuple):
     """Sampled futures of some sequences after their first `context` steps."""
 

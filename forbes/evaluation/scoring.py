@@ -24,7 +24,7 @@ from forbes.models import BeliefModel, StateSpaceModel
 from forbes.pomdps import Process
 from forbes.seeding import derive_seed
 
-__all__ = ["PASSES", "Parts", "Pass", "Scores", "exact_pass", "make_pass", "require_finite", "score_split"]
+__all__ = ["Parts", "Pass", "Scores", "exact_pass", "make_pass", "require_finite", "score_split"]
 
 
 class Pass(NamedTuple):
@@ -66,14 +66,13 @@ class Scores(NamedTuple):
         return total / self.steps if metric == "ess" else total
 
 
-PASSES = ("elbo", "pll", "fivo", "open-loop")
 _BOUNDS = ("elbo", "reconstruction", "kl", "iwae", "fivo", "ess")
 _FIVO_ROWS = 16
 """FIVO holds all particles of a sequence at once: so many rows for each sequence of another pass's batch."""
 
 
 def make_pass(name: str, number: int, batch_size: int, context: int) -> Pass:
-    """Build one of `PASSES`.
+    """Build one of the passes that `forbes evaluate --scores` names.
 
     Args:
         name: elbo (with its parts), pll (and the IWAE of the same trajectories), fivo (with its effective sample

@@ -1,14 +1,12 @@
 """`forbes theorem`: Theorem 1 on linear-Gaussian processes, and why a higher ELBO is not a better belief."""
 
 import argparse
-import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 
 from rich.console import Console
 from rich.table import Table
 
-from forbes.arguments import ArgumentParser, positive
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.theorem import (
@@ -26,19 +24,10 @@ from forbes.evaluation.theorem import (
     smoothing,
     structured_optimum,
 )
+from forbes.parsers.theorem import parser
 from forbes.seeding import generator
 
 __all__ = ["main"]
-
-_DESCRIPTION = """\
-Check Theorem 1 where everything is known, and show that a higher ELBO is not a better belief.
-
-  forbes theorem
-  forbes theorem --transition 0.9 --process-noise 0.3 --observation-noise 0.5 --steps 30
-
-The process is s_1 ~ N(0, 1), s_t = F s_t-1 + N(0, Q), o_t = s_t + N(0, R). Without F, Q and R: three of them. All
-numbers are means over observations of the process, in closed form but for the column Monte Carlo. log p - ELBO and
-log p - PLL are 0 at best; PLL, the prequential log-likelihood, scores each belief by the next observation."""
 
 _CASES = ((1.0, 1.0, 1.0), (1.0, 0.1, 1.0), (0.9, 0.3, 0.5))
 _POSTERIORS: Mapping[str, Callable[[LinearGaussian], Conditional]] = {
@@ -48,7 +37,6 @@ _POSTERIORS: Mapping[str, Callable[[LinearGaussian], Conditional]] = {
     "optimal q(s_t | s_t-1, o_1:t)": structured_optimum,
 }
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-_STEPS = 200  # powers of F stay in the range of float64, and so do the matrices in memory
 _NUMBERS = 30_000_000  # drawn for one row; they take 1 GB
 
 _IDENTITY = """\
@@ -64,7 +52,7 @@ opposite orders."""
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
-    args = _parser().parse_args(argv)
+    args = parser().parse_args(argv)
     if args.samples * args.steps > _NUMBERS:
         raise ForbesError(f"--samples {args.samples}: expected at most {_NUMBERS // args.steps} of {args.steps} steps")
     processes = _processes(args)
@@ -81,45 +69,6 @@ def _processes(args: argparse.Namespace) -> list[LinearGaussian]:
         return [LinearGaussian(*case, args.steps) for case in _CASES]
     transition, process_noise, observation_noise = (1.0 if value is None else value for value in given)
     return [LinearGaussian(transition, process_noise, observation_noise, args.steps)]
-
-
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser("forbes theorem", _DESCRIPTION)
-    parser.add_argument("--transition", type=_finite, metavar="F", help="default: 1; with 0 all four are exact")
-    parser.add_argument("--process-noise", type=_variance, metavar="Q", help="a variance; default: 1")
-    parser.add_argument("--observation-noise", type=_variance, metavar="R", help="a variance; default: 1")
-    parser.add_argument("--steps", type=_steps, default=15, metavar="T", help=f"at most {_STEPS} (default: 15)")
-    parser.add_argument("--samples", type=_several, default=20_000, metavar="N", help="Monte Carlo (default: 20000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the samples (default: 0)")
-    return parser
-
-
-def _finite(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text} is not a number")
-    return value
-
-
-def _variance(text: str) -> float:
-    if (value := _finite(text)) <= 0:
-        raise argparse.ArgumentTypeError(f"{text} is not a variance above 0")
-    return value
-
-
-def _steps(text: str) -> int:
-    if (value := positive(text)) > _STEPS:
-        raise argparse.ArgumentTypeError(f"{text} is above {_STEPS}")
-    return value
-
-
-def _several(text: str) -> int:
-    if (value := positive(text)) < 2:
-        raise argparse.ArgumentTypeError(f"{text} is below 2, a standard error needs two")
-    return value
 
 
 def _name(process: LinearGaussian) -> str:

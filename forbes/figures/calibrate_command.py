@@ -3,14 +3,12 @@
 import sys
 from collections.abc import Sequence
 from itertools import cycle
-from pathlib import Path
 
 import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from forbes.arguments import ArgumentParser, positive
 from forbes.errors import ForbesError
 from forbes.evaluation.calibration import coverage
 from forbes.evaluation.runs import TrainedRun, load_runs, run_titles
@@ -19,25 +17,15 @@ from forbes.evaluation.uniformity import kolmogorov_smirnov, pearson, spread
 from forbes.figures.calibration import RankedBelief, calibration
 from forbes.figures.style import PALETTE, save_figure
 from forbes.models import StateSpaceModel
+from forbes.parsers.calibrate import parser
 from forbes.seeding import generator
 
 __all__ = ["main"]
 
-_DESCRIPTION = """\
-Check the calibration of trained models against themselves, without ground truth.
-
-  forbes calibrate runs/compare/forbes-0 runs/compare/rssm-0 -o figures
-
-States and observations are drawn from the model's own prior; the filter sees the observations, and the drawn state is
-ranked among samples of its belief. Ranks are uniform where the filter is exact. A small p-value says that it is not;
-that fewer than 90 % of the states lie in the 90 % region says that its beliefs are too narrow. A filter trained by the
-ELBO is expected to be so. Ranks are tested by Pearson, TARP's f by Kolmogorov and Smirnov, and a classifier tries to
-tell drawn states from samples of the beliefs. Prints a table, and draws calibration.png and calibration.pdf."""
-
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
-    args = _parser().parse_args(argv)
+    args = parser().parse_args(argv)
     runs = load_runs(args.runs)
     found = [_check(run, args.sequences, args.time, args.samples, args.seed) for run in runs]
     _print(runs, found, args.samples)
@@ -49,17 +37,6 @@ def main(argv: Sequence[str]) -> None:
     for suffix in (".png", ".pdf"):
         save_figure(figure, args.output / f"calibration{suffix}")
         print(args.output / f"calibration{suffix}")
-
-
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser("forbes calibrate", _DESCRIPTION)
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made")
-    parser.add_argument("--sequences", type=positive, default=1000, help="N, drawn from the model (default: 1000)")
-    parser.add_argument("--samples", type=positive, default=99, help="L, of each belief (default: 99)")
-    parser.add_argument("--time", type=positive, default=15, help="step whose belief is checked (default: 15)")
-    parser.add_argument("--seed", type=int, default=0, help="of all that is drawn (default: 0)")
-    parser.add_argument("-o", "--output", type=Path, default=Path("figures"), help="folder (default: figures)")
-    return parser
 
 
 def _check(run: TrainedRun, sequences: int, time: int, samples: int, seed: int) -> SelfCalibration:

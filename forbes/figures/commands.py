@@ -11,7 +11,6 @@ import torch
 import yaml
 from matplotlib.figure import Figure
 
-from forbes.arguments import ArgumentParser, positive
 from forbes.data import Strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import whole_sequences
@@ -21,31 +20,17 @@ from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs
 from forbes.figures.returns import returns_against_env_steps
 from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
 from forbes.figures.style import PALETTE, save_figure
+from forbes.parsers.figures import parser
 from forbes.training.run_folder import RunFolder, read_metrics
 
 __all__ = ["main"]
-
-_DESCRIPTION = """\
-Draw the paper's figures from run folders, each as PNG and PDF.
-
-  forbes figures strokes --runs runs/compare/forbes-0 runs/compare/rssm-0 -o figures
-  forbes figures agents --runs runs/hike/forbes-{0,1,2} runs/hike/dreamer-{0,1,2} -o figures
-
-agents: returns, what agents of one task earn without exploration against env steps. Runs whose folders differ in the
-number at the end only are one curve, their mean and range; it is called as they are, forbes and dreamer here.
-
-strokes: predictions-t30 (Figure 4), the same rolled on to the end of the longest digit, and elbo (Figure 5). Runs that
-differ in their seed only are one family: Figure 4 shows the first of them, Figure 5 their mean and range. A family that
-is trained by another bound than the ELBO is drawn by that one, and the legend says so.
-Digits of Figure 4, unless --index names others: of the first 500 test digits, for each class the one whose beginning
-leaves its class most open, judged by the labels of its 50 nearest training digits. No model has a say in the choice."""
 
 _FORMATS = (".png", ".pdf")
 
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
-    args = _parser().parse_args(argv)
+    args = parser().parse_args(argv)
     if args.experiment == "agents":
         _save(returns_against_env_steps(*_agents(args.runs)), args.output, "returns")
     else:
@@ -73,22 +58,6 @@ def _strokes(args: argparse.Namespace) -> None:
     found = references(data, runs[0].model.likelihood, "validation", count) if count else {}
     means = {name: values.sum(1).mean().item() for name, values in found.items()}
     _save(elbo_against_updates(families, means), args.output, "elbo")
-
-
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser("forbes figures", _DESCRIPTION)
-    parser.add_argument("experiment", choices=["strokes", "agents"], help="whose figures")
-    parser.add_argument(
-        "--runs", nargs="+", required=True, metavar="RUN", help="run folders that `forbes fit` has made"
-    )
-    parser.add_argument("-o", "--output", type=Path, default=Path("figures"), help="folder (default: figures)")
-    parser.add_argument("--index", type=int, nargs="+", help="test digits of Figure 4")
-    parser.add_argument("--samples", type=positive, default=6, help="completions of each digit (default: 6)")
-    parser.add_argument(
-        "--mean", action="store_true", help="of written strokes, how likely each pixel is on, in place of a drawing"
-    )
-    parser.add_argument("--context", type=positive, default=15, help="frames that the models see (default: 15)")
-    return parser
 
 
 def _agents(runs: Sequence[str]) -> tuple[str, dict[str, list[pd.Series]]]:

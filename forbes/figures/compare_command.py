@@ -13,15 +13,15 @@ import yaml
 from rich.console import Console
 from rich.markdown import Markdown
 
-from forbes.arguments import ArgumentParser, positive
 from forbes.errors import ForbesError
-from forbes.evaluation.commands import add_score_options, evaluate, wanted_metrics
+from forbes.evaluation.commands import evaluate, wanted_metrics
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record
 from forbes.evaluation.runs import load_runs
 from forbes.figures.comparison import differences, per_step, scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
+from forbes.parsers.compare import parser
 from forbes.training.configuration import allowed_modules
 from forbes.training.jobs import Job, run_jobs
 from forbes.training.provenance import command_line, commit
@@ -31,23 +31,11 @@ __all__ = ["main"]
 
 _SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed")  # the first is linked to the others
 
-_DESCRIPTION = """\
-Train configurations under several seeds, measure all of them on the same sequences, and compare.
-
-  forbes compare configs/strokes/rssm.yaml configs/strokes/forbes.yaml --seeds 3
-  forbes compare configs/strokes/rssm.yaml configs/strokes/forbes.yaml -o runs/dejong -- --data.source.origin dejong
-
-Each run is a folder DIR/NAME-SEED; what follows -- is given to each `forbes fit`. Then `forbes evaluate` measures what
-has not been measured yet. Writes comparison.csv, .json and .md, and pictures: scores, per-step, differences (to the
-first configuration). Interrupted, the same command goes on where it stopped, for days if need be.
-
-  forbes compare configs/strokes/*.yaml --seeds 5 --jobs 2      # two trainings side by side, a progress line each"""
-
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     cut = argv.index("--") if "--" in argv else len(argv)
-    args, flags = _parser().parse_args(argv[:cut]), list(argv[cut + 1 :])
+    args, flags = parser().parse_args(argv[:cut]), list(argv[cut + 1 :])
     command = command_line("compare", *argv)
     folders = _run_folders(args.configs, args.seeds, args.output)
     _train(
@@ -75,25 +63,6 @@ def main(argv: Sequence[str]) -> None:
         evaluate(missing, args, command)
     comparison = compare(families, [metric for metric in wanted[0] if any(has[metric] for has in wanted)])
     _write(comparison, families, args.output, command)
-
-
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser("forbes compare", _DESCRIPTION)
-    parser.add_argument("configs", nargs="+", metavar="CONFIG", help="configurations; the others are held to the first")
-    parser.add_argument("--seeds", type=positive, default=1, help="runs of each, seeds 0, 1, … (default: 1)")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("runs/compare"), metavar="DIR", help="default: runs/compare"
-    )
-    parser.add_argument(
-        "--jobs",
-        type=positive,
-        default=1,
-        metavar="N",
-        help="trainings at a time, sharing the threads (default: 1)",
-    )
-    measures = parser.add_argument_group("how they are measured, as for forbes evaluate")
-    add_score_options(measures)
-    return parser
 
 
 def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, dict[int, str]]:

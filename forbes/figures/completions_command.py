@@ -2,13 +2,11 @@
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pandas as pd
 
-from forbes.arguments import ArgumentParser, positive
-from forbes.data import Split, Strokes
+from forbes.data import Strokes
 from forbes.data.digit_classifiers import CLASSIFIERS_SHA256, load_judges
 from forbes.errors import ForbesError
 from forbes.evaluation.completion_study import Study, entries, print_study, study
@@ -17,6 +15,7 @@ from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs
 from forbes.figures.completions import by_ambiguity, drawings, errors, scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
+from forbes.parsers.completions import parser
 from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
@@ -24,30 +23,10 @@ __all__ = ["main"]
 
 _DRAWN = 10  # digits in a picture
 
-_DESCRIPTION = """\
-Let models complete the beginnings of digits, and let classifiers read what they have drawn.
-
-  forbes completions runs/compare/forbes-0 runs/compare/rssm-0 -o figures
-
-Completions are read at the step at which the true digit ends; models learn no sign of the end, and are told none.
-
-  JS, entropy   distribution of the class over completions, against that of a calibrated classifier of beginnings, the
-                reference r(y | o_1..c)
-  -log p, ECE   the same distribution against the true class
-  clear digits  share of completions that a classifier of digits gives more than 0.9 for one class
-  class kept    of the completions whose class was clear after 60 % (80 %) of the rest, those that end in this class
-  energy, CRPS  proper scores of the pixels, drawn from the grey values: jointly, and each on its own
-  grey ink      share of the ink with a grey value between 0.1 and 0.9
-  error         squared, in pixels: of one completion, of the best of N, and of the average picture of N
-
-Beside the models: similar digits, the N training digits that begin most alike, in place of completions; and the true
-digits, which bound what concerns one completion and have no diversity. Writes completions.json and .csv, and pictures,
-a drawing for each length of the beginning. On one core, a run takes some 80 seconds for each hundred digits."""
-
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
-    args = _parser().parse_args(argv)
+    args = parser().parse_args(argv)
     runs = load_runs(args.runs)
     _check(args, runs)
     data = runs[0].data
@@ -71,22 +50,6 @@ def main(argv: Sequence[str]) -> None:
     }
     _write(args, record, studies)
     _draw(args, runs, studies)
-
-
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser("forbes completions", _DESCRIPTION)
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made, of strokes")
-    parser.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
-    parser.add_argument(
-        "--sequences", "--digits", type=positive, default=300, help="the first so many of the split (default: 300)"
-    )
-    parser.add_argument("--samples", type=positive, default=100, help="N, completions of each digit (default: 100)")
-    parser.add_argument(
-        "--prefixes", type=positive, nargs="+", default=[5, 10, 15], help="steps that models see (default: 5 10 15)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of the completions (default: 0)")
-    parser.add_argument("-o", "--output", type=Path, default=Path("figures"), help="folder (default: figures)")
-    return parser
 
 
 def _check(args: Any, runs: Sequence[TrainedRun]) -> None:

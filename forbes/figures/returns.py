@@ -31,7 +31,8 @@ def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Seque
         axes = figure.subplots()
         for (method, curves), colour in zip(published.items(), cycle((ORANGE, *PALETTE[2:])), strict=False):
             draw_range(axes, _joined(curves), colour, f"{method}, published, {len(curves)} seeds")
-        axes.plot(exploring.index, exploring, color=GREY, lw=0.6, label="exploring")
+        marker = "." if len(exploring) == 1 else ""
+        axes.plot(exploring.index, exploring, color=GREY, lw=0.6, label="exploring", marker=marker)
         axes.plot(acting.index, acting, ".-", color=PALETTE[0], markersize=3, label="acting, without exploration")
         _label(axes, task, table.index.max())
     return figure
@@ -43,13 +44,18 @@ def returns_against_env_steps(task: str, agents: Mapping[str, Sequence[pd.Series
     Args:
         task: the title.
         agents: by name, a curve for each seed, returns against env steps.
+
+    Raises:
+        ForbesError: where the curves of an agent have no step in common.
     """
     with paper_style():
         figure = Figure((COLUMN, 2.6), layout="constrained")
         axes = figure.subplots()
         for (name, curves), colour in zip(agents.items(), cycle(PALETTE), strict=False):
             label = name if len(curves) == 1 else f"{name}, {len(curves)} seeds"
-            draw_range(axes, _joined(curves), colour, label)
+            if (joined := _joined(curves)).empty:
+                raise ForbesError(f"{name}: no step was reached by all its {len(curves)} seeds. Train them further")
+            draw_range(axes, joined, colour, label)
         _label(axes, task, max(curve.index.max() for curves in agents.values() for curve in curves))
     return figure
 

@@ -74,7 +74,8 @@ def density_map(colour: str) -> LinearSegmentedColormap:
 def draw_range(axes: Axes, runs: pd.DataFrame, colour: str, label: str) -> None:
     """Draw mean and range of several runs, a column each, against the index."""
     axes.fill_between(runs.index, runs.min(axis=1), runs.max(axis=1), color=colour, alpha=0.2, lw=0)
-    axes.plot(runs.index, runs.mean(axis=1), color=colour, label=label)
+    marker = "o" if len(runs) == 1 else ""  # a line of one point would not be seen
+    axes.plot(runs.index, runs.mean(axis=1), color=colour, label=label, marker=marker, markersize=3)
 
 
 def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", "y"] = "y") -> None:

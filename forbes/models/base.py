@@ -16,10 +16,12 @@ from forbes.beliefs import BeliefFamily
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, Perceptron
+from forbes.shapes import printed_by_shape
 
 __all__ = ["BeliefModel", "ModelFamily", "Prediction", "Rollout", "Seen", "State"]
 
 
+@printed_by_shape
 class State(NamedTuple):
     """What the recurrence carries."""
 
@@ -29,6 +31,7 @@ class State(NamedTuple):
     """s, `(*, D)`."""
 
 
+@printed_by_shape
 class Rollout(NamedTuple):
     """A trajectory of the prior."""
 
@@ -45,6 +48,7 @@ class Rollout(NamedTuple):
         return torch.cat((self.hidden, self.state), -1)  # (B, T, H + D)
 
 
+@printed_by_shape
 class Seen(NamedTuple):
     """What a filter reads, encoded once for all the times it is read."""
 
@@ -56,6 +60,7 @@ class Seen(NamedTuple):
     """a_{t-1}, `(B, T, A)`."""
 
 
+@printed_by_shape
 class Prediction(NamedTuple):
     r"""What a belief says of every next observation: :math:`p(o_t \mid o_{<t}) = \sum_k W^k p(o_t \mid x^k)`."""
 

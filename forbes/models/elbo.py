@@ -5,6 +5,8 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
+from forbes.shapes import printed_by_shape
+
 __all__ = ["KL", "ElboTerms", "FreeNats", "elbo_loss"]
 
 FreeNats = Literal["batch", "element"]
@@ -18,6 +20,7 @@ KL = Literal["analytic", "monte_carlo", "path"]
 """
 
 
+@printed_by_shape
 class ElboTerms(NamedTuple):
     r"""The parts of the bound, per step, in nats.
 

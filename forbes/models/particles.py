@@ -28,6 +28,7 @@ from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder
 from forbes.models.state_space import StateSpaceModel
 from forbes.precision import full_precision
+from forbes.shapes import printed_by_shape
 
 __all__ = ["ParticleModel", "Particles", "effective_sample_size", "run_particles", "soft", "systematic"]
 __all__ += ["systematic_resampling"]
@@ -39,6 +40,7 @@ _SOFTNESS = 0.5
 """α of soft resampling: the share of ancestors that are drawn by weight."""
 
 
+@printed_by_shape
 class Particles(NamedTuple):
     """The particles of one step, before they are drawn anew."""
 

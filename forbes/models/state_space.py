@@ -24,10 +24,12 @@ from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, Perceptron, bind_gru
 from forbes.precision import full_precision
+from forbes.shapes import printed_by_shape
 
 __all__ = ["Filtered", "StateSpaceModel"]
 
 
+@printed_by_shape
 class Filtered(NamedTuple):
     """A trajectory of the posterior, with what the bound and further samples need; one step of it has no T."""
 

@@ -13,10 +13,12 @@ from forbes.errors import ForbesError
 from forbes.named import Named
 from forbes.pomdps.beliefs import ExactBelief, GaussianMixtureBelief
 from forbes.pomdps.distributions import Distribution
+from forbes.shapes import printed_by_shape
 
 __all__ = ["AffineGaussian", "ExactFilter", "Process", "Trajectories", "require_positive"]
 
 
+@printed_by_shape
 class Trajectories(NamedTuple):
     """Sequences of a process in float64. Index t holds (s_t, o_t, a_{t-1}): the action that led there, 0 at the start.
 
@@ -35,6 +37,7 @@ class Trajectories(NamedTuple):
     """a_{t-1}, `(B, T, A)`; A may be 0."""
 
 
+@printed_by_shape
 class ExactFilter(NamedTuple):
     """What one exact pass over the observations gives."""
 
@@ -49,6 +52,7 @@ class ExactFilter(NamedTuple):
         return self.step_log_likelihood.sum(1)
 
 
+@printed_by_shape
 class AffineGaussian(NamedTuple):
     r"""A Gaussian whose mean is affine in the state before: :math:`p(s_t \mid s_{t-1}) = N(G_t s_{t-1} + g_t, C_t)`."""
 

@@ -1,6 +1,5 @@
 """`forbes data collect`: episodes that a random policy plays, or an agent that has learned."""
 
-import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,25 +7,17 @@ from typing import Any
 
 from rich.progress import track
 
-from forbes.arguments import positive
-from forbes.data import commands
 from forbes.data.collection import MakePolicy, collect_episodes, random_policy
-from forbes.data.episode_commands import Add, count_steps
+from forbes.data.episode_commands import count_steps
 from forbes.data.episode_store import EpisodeWriter
 from forbes.envs import Environment, EnvironmentProcess, find_environment
-from forbes.envs.tasks import TASKS
 from forbes.errors import ForbesError
 from forbes.training.acting import Acting
 from forbes.training.loading import loaded_agent
 
-__all__ = ["collect", "main"]
+__all__ = ["collect"]
 
 _RANDOM = "random"
-
-
-def main(argv: list[str]) -> int | None:
-    """Run `forbes data …`, of which `collect` alone knows agents."""
-    return commands.main(argv, _add_collect)
 
 
 def collect(output: Path, episodes: int, policy: str, seed: int, **environment: Any) -> None:
@@ -67,23 +58,3 @@ def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, M
         timeout = given.pop("timeout", 60.0)
         with EnvironmentProcess(find_environment(**given), timeout) as environment:
             yield environment, random_policy
-
-
-def _add_collect(add: Add) -> None:
-    play = add("collect", collect, "collect --task cartpole_swingup --episodes 40 -o episodes/cartpole")
-    play.formatter_class = argparse.RawDescriptionHelpFormatter
-    play.epilog = (
-        f"tasks:\n{TASKS}\n\n{play.epilog}\n"
-        "         forbes data collect --policy RUN --episodes 80 -o episodes/cartpole    # 40 more, by an agent"
-    )
-    play.add_argument("--task", help="see below; an agent has its own")
-    play.add_argument("--episodes", type=positive, default=10, help="how many DIR has had in the end (10)")
-    play.add_argument("--policy", default=_RANDOM, metavar="random|RUN", help="who acts: a run's agent explores")
-    play.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the episodes")
-    play.add_argument("--seed", type=int, default=0, help="episode n is a function of the seed and n")
-    play.add_argument("--action-repeat", type=positive, help="frames for which an action is held")
-    play.add_argument("--pixels", action=argparse.BooleanOptionalAction, help="observe images, or what is measured")
-    play.add_argument("--size", type=positive, help="pixels a side (64)")
-    play.add_argument("--camera", type=int, help="number of the camera")
-    play.add_argument("--fast", action="store_const", const=True, help="no shadows: other pixels")
-    play.add_argument("--timeout", type=float, help="seconds for an answer of the environment (60)")

@@ -25,6 +25,7 @@ from torch import Tensor
 import forbes.training.callbacks  # noqa: F401  so that configurations know them by their short names
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
+from forbes.parsers.fit import DESCRIPTION, run_options
 from forbes.training.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_by_lightning, raised_inside
 from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults, data_paths
@@ -38,13 +39,6 @@ from forbes.training.trainer_arguments import require_usable
 
 __all__ = ["fit", "predict", "test", "validate"]
 
-DESCRIPTION = {
-    "fit": "Train a model. It leaves a run folder with the configuration, metrics, checkpoint and figures.",
-    "validate": "Run the validation loop of a trained model.",
-    "test": "Run the test loop of a trained model; `forbes evaluate` measures it with care.",
-    "predict": "Print a line for each sequence of the test split: the bound of a world model in nats, or -log q of "
-    "each true state.",
-}
 _LIMITS = ("max_epochs", "max_steps", "max_time", "limit_train_batches")
 
 _NOT_OURS = (  # warnings that say nothing true or useful here
@@ -52,6 +46,7 @@ _NOT_OURS = (  # warnings that say nothing true or useful here
     ".*dataloader is not resumable.*",  # it goes on from the trainer's update
     ".*`IterableDataset` has `__len__` defined.*",  # there are no workers
     ".*You requested to overfit but enabled .* dataloader shuffling.*",  # nor do they shuffle
+    ".*smaller than the logging interval.*",  # the interval counts updates, whatever number of them is an epoch
     ".*treespec, LeafSpec.*",  # Lightning 2.6 calls torch 2.13 the old way
     "(?s).*JsonargparseDeprecationWarning",  # and jsonargparse 4.53
     "(?s).*instantiate_classes",
@@ -115,7 +110,7 @@ class _Experiment(LightningCLI):
 
     def __init__(self, command: str, arguments: Sequence[str], stack: ExitStack) -> None:
         self.command, self.arguments, self.stack = command, arguments, stack
-        options = _run_options()
+        options = run_options()
         self.options, rest = options.parse_known_args(arguments if command == "fit" else [])
         for option in ("resume", "run_dir"):
             if (folder := getattr(self.options, option)) and folder.endswith(".ckpt"):
@@ -262,17 +257,3 @@ def _print_predictions(found: Sequence[Tensor]) -> None:
 def _as_list(value: Any) -> list[Any]:
     """Give what a configuration holds as one thing, several, or none."""
     return [] if value is None else list(value) if isinstance(value, list) else [value]
-
-
-def _run_options() -> argparse.ArgumentParser:
-    """Give the options of `fit` that are not part of a configuration."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False, usage=argparse.SUPPRESS)
-    group = parser.add_argument_group(
-        "run folder, runs/EXPERIMENT/TIME-SEED/ by default"
-    ).add_mutually_exclusive_group()
-    group.add_argument("--experiment", metavar="NAME", help="instead of the configuration's name")
-    group.add_argument("--run_dir", metavar="DIR", help="the folder itself")
-    group.add_argument(
-        "--resume", metavar="RUN", help="go on with this run, from its last checkpoint with its config.yaml; flags win"
-    )
-    return parser

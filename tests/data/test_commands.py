@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from forbes.data import commands
 from forbes.data.download import git_blob_id
 from forbes.data.stroke_file import load_strokes, save_strokes
 from forbes.data.strokes import bundled_path
 from forbes.errors import ForbesError
-from forbes.training import collect_command
+from forbes.parsers.data import main
 
 
 @pytest.fixture
@@ -29,7 +28,7 @@ def test_building_twice_gives_the_same_bytes(images, tmp_path, capsys):
     output = tmp_path / "strokes.npz"
 
     for change in ("new", "unchanged"):
-        commands.main(["build-strokes", "--images", str(images), "-o", str(output)])
+        main(["build-strokes", "--images", str(images), "-o", str(output)])
         digest = hashlib.sha256(output.read_bytes()).hexdigest()
         assert f"sha256 {digest}, {change}" in capsys.readouterr().out
 
@@ -37,8 +36,8 @@ def test_building_twice_gives_the_same_bytes(images, tmp_path, capsys):
 
 
 def test_show_draws_each_digit_as_a_row(tmp_path, capsys):
-    commands.main(["show", "strokes", "--index", "0", "3", "-o", str(tmp_path / "two.png")])
-    commands.main(["show", "strokes", "--index", "0", "-o", str(tmp_path / "one.png")])
+    main(["show", "strokes", "--index", "0", "3", "-o", str(tmp_path / "two.png")])
+    main(["show", "strokes", "--index", "0", "-o", str(tmp_path / "one.png")])
 
     two, one = (np.asarray(Image.open(tmp_path / name)) for name in ("two.png", "one.png"))
     assert abs(two.shape[0] - 2 * one.shape[0]) <= 1  # in pixels
@@ -49,7 +48,7 @@ def test_show_draws_each_digit_as_a_row(tmp_path, capsys):
 @pytest.mark.parametrize("index", ["10000", "-1"])
 def test_a_digit_outside_its_split_is_refused(tmp_path, index):
     with pytest.raises(ForbesError, match=f"{index} is no digit of the split test, expected 0 to 9999"):
-        commands.main(["show", "strokes", f"--index={index}", "-o", str(tmp_path / "strokes.png")])
+        main(["show", "strokes", f"--index={index}", "-o", str(tmp_path / "strokes.png")])
 
 
 @pytest.mark.parametrize("name", ["strokes.xyz", "absent/strokes.png"])
@@ -57,7 +56,7 @@ def test_a_picture_that_cannot_be_written_is_named(tmp_path, name):
     with pytest.raises(
         ForbesError, match=rf"{name}: cannot be written \(.*\)\. Choose another place or end it in \.png"
     ):
-        commands.main(["show", "strokes", "-o", str(tmp_path / name)])
+        main(["show", "strokes", "-o", str(tmp_path / name)])
 
 
 def test_fetch_stores_where_forbes_data_points(make_arrays, tmp_path, monkeypatch, capsys):
@@ -65,10 +64,10 @@ def test_fetch_stores_where_forbes_data_points(make_arrays, tmp_path, monkeypatc
     splits = {split: make_arrays([[(1, 1)]]) for split in ("train", "test")}
     save_strokes(tmp_path / "converted.npz", splits)
     with pytest.raises(ForbesError, match=r'converted\.npz: array "train_points" has sha256'):
-        commands.main(["fetch", "strokes", "--from", str(tmp_path / "converted.npz")])
+        main(["fetch", "strokes", "--from", str(tmp_path / "converted.npz")])
 
     monkeypatch.setattr("forbes.data.fetch.verify_dejong", lambda *_: None)
-    commands.main(["fetch", "strokes", "--from", str(tmp_path / "converted.npz")])
+    main(["fetch", "strokes", "--from", str(tmp_path / "converted.npz")])
 
     assert load_strokes(tmp_path / "store" / "dejong-strokes.npz", "")["train"].points.tolist() == [[1, 1]]
     assert f"{tmp_path / 'store' / 'dejong-strokes.npz'}: stored" in capsys.readouterr().out
@@ -80,11 +79,11 @@ def test_fetched_curves_are_stored_there_too(tmp_path, monkeypatch, capsys):
     for module in ("published", "commands"):
         monkeypatch.setattr(f"forbes.data.{module}.CURVES_BLOB", git_blob_id(tmp_path / "copy.json"))
 
-    commands.main(["fetch", "curves", "--from", str(tmp_path / "copy.json")])
+    main(["fetch", "curves", "--from", str(tmp_path / "copy.json")])
 
     assert (tmp_path / "store" / "dreamer-curves.json").read_text() == "[]"
     assert f"{tmp_path / 'store' / 'dreamer-curves.json'}: stored" in capsys.readouterr().out
-    commands.main(["fetch", "curves"])  # nothing is downloaded again
+    main(["fetch", "curves"])  # nothing is downloaded again
     assert "is there already, whole" in capsys.readouterr().out
 
 
@@ -93,14 +92,14 @@ def test_fetch_does_not_trust_a_stored_file_that_is_not_the_papers(make_arrays, 
     save_strokes(tmp_path / "dejong-strokes.npz", {split: make_arrays([[(1, 1)]]) for split in ("train", "test")})
 
     with pytest.raises(ForbesError, match=r'dejong-strokes\.npz: array "train_points" has sha256 .* Delete it'):
-        commands.main(["fetch", "strokes"])
+        main(["fetch", "strokes"])
 
 
 def test_a_set_compared_with_itself_is_the_same(capsys, make_arrays, tmp_path):
     path = tmp_path / "strokes.npz"
     save_strokes(path, {split: make_arrays([[(1, 1), (1, 2), (1, 3)]]) for split in ("train", "test")})
 
-    commands.main(["compare-strokes", str(path), str(path)])
+    main(["compare-strokes", str(path), str(path)])
 
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[-1] for line in lines[:3]] == ["1.000", "0.000", "1.000"]
@@ -112,7 +111,7 @@ COMMANDS = ["build-strokes", "build-classifiers", "fetch", "compare-strokes", "s
 
 def test_help_has_an_example_of_every_command(capsys):
     with pytest.raises(SystemExit):
-        collect_command.main(["--help"])
+        main(["--help"])
 
     examples = capsys.readouterr().out.partition("examples:")[2]
     assert [line.split()[2] for line in examples.splitlines() if line] == COMMANDS
@@ -121,7 +120,7 @@ def test_help_has_an_example_of_every_command(capsys):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_help_of_a_command_ends_with_an_example(command, capsys):
     with pytest.raises(SystemExit):
-        collect_command.main([command, "--help"])
+        main([command, "--help"])
 
     assert f"example: forbes data {command} " in " ".join(capsys.readouterr().out.split())
 

@@ -12,6 +12,7 @@ from forbes.data import digit_classifiers as shipped
 from forbes.data.classifier_training import calibrate, classify, digits_of, draw_finished, fit, quality
 from forbes.data.digit_classifiers import CLASSIFIERS_SHA256, calibration_error, classifiers_path, load_judges
 from forbes.errors import ForbesError
+from forbes.parsers.data import main
 
 DIGITS = 1000
 
@@ -142,7 +143,7 @@ def test_the_command_builds_a_file_from_both_sets_and_says_how_good_it_is(stroke
     monkeypatch.setattr(classifier_training, "_BATCH", 4)
     path = tmp_path / "new" / "classifiers.npz"
 
-    commands.main(["build-classifiers", "-o", str(path)])
+    main(["build-classifiers", "-o", str(path)])
 
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:3] for line in lines[1:-1]] == [

@@ -13,7 +13,8 @@ from forbes.data.episode_store import EpisodeStore, EpisodeWriter, first_held
 from forbes.data.episodes import DamagedEpisodeError, Episode
 from forbes.errors import ForbesError
 
-ENVIRONMENT = {"task": "Counting", "observation_shape": [2], "action_dim": 1, "made_by": {"machine": "this"}}
+ENVIRONMENT = {"task": "Counting", "observation_shape": [2], "action_dim": 1, "discrete": False}
+ENVIRONMENT["made_by"] = {"machine": "this"}
 
 
 def episode(number, steps=5):
@@ -306,3 +307,18 @@ def test_episodes_of_another_environment_are_refused_but_another_machine_is_welc
             append(writer, environment=ENVIRONMENT | {"task": "Other"})
         append(writer, environment=ENVIRONMENT | {"made_by": {"machine": "that"}})
     assert numbers(store) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("missing", ["task", "observation_shape", "action_dim", "discrete"])
+def test_an_environment_that_says_too_little_is_refused_when_it_is_given(missing, store):
+    about = {name: value for name, value in ENVIRONMENT.items() if name != missing}
+    sentence = f"its environment has no {missing}, expected what `describe_environment` gives"
+    with EpisodeWriter(store) as writer, pytest.raises(ForbesError, match=sentence):
+        append(writer, environment=about)
+    assert numbers(store) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("name", "value"), [("observation_shape", [3]), ("action_dim", 2)])
+def test_an_environment_of_other_shapes_than_its_episode_is_refused(name, value, tmp_path):
+    with EpisodeWriter(tmp_path) as writer, pytest.raises(ForbesError, match=f"its environment's {name} is"):
+        append(writer, environment=ENVIRONMENT | {name: value})

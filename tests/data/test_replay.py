@@ -271,3 +271,11 @@ def test_a_damaged_episode_ends_the_training_with_its_name(path):
 
     with pytest.raises(ForbesError, match=r"000001\.npz: damaged .*forbes data check"):
         source.gather("train", torch.arange(source.size("train")), 4)
+
+
+def test_a_store_that_does_not_say_its_shapes_is_one_sentence(path):
+    index = path / "index.jsonl"
+    index.write_text(index.read_text().replace('"observation_shape": [2], ', ""))
+
+    with pytest.raises(ForbesError, match="its episodes do not say the observation_shape of their environment"):
+        Replay(str(path))

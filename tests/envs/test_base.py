@@ -28,11 +28,11 @@ def test_the_end_of_an_episode_is_not_passed():
     assert (step.reward, step.frames, step.terminated) == (3.0, 2, True)
 
 
-def test_an_action_fills_its_bounds_and_is_left_alone_where_there_are_none():
-    low, high = np.array([0.0, -2.0, -np.inf, 1.0]), np.array([4.0, 2.0, np.inf, np.inf])
+def test_an_action_fills_its_bounds_and_keeps_its_scale_at_missing_ones():
+    low, high = np.array([0, -2, -np.inf, 1, -np.inf]), np.array([4, 2, np.inf, np.inf, -5])
 
-    for action, expected in ((-1, [0, -2, -1, -1]), (0, [2, 0, 0, 0]), (1, [4, 2, 1, 1])):
-        assert scale_action(np.full(4, action, np.float32), low, high).tolist() == expected
+    for action, expected in ((-1, [0, -2, -1, 1, -7]), (0, [2, 0, 0, 2, -6]), (1, [4, 2, 1, 3, -5])):
+        assert scale_action(np.full(5, action, np.float32), low, high).tolist() == expected
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,13 @@ import pytest
 
 gymnasium = pytest.importorskip("gymnasium")
 
-from forbes.envs import Gymnasium  # noqa: E402
+import toy_gymnasium  # noqa: E402
+from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiDiscrete, OneOf, Sequence, Text, Tuple  # noqa: E402
+
+from forbes.cli import main  # noqa: E402
+from forbes.data.episode_store import EpisodeStore  # noqa: E402
+from forbes.envs import Gymnasium, find_environment  # noqa: E402
+from forbes.envs.base import check_step  # noqa: E402
 from forbes.errors import ForbesError  # noqa: E402
 
 
@@ -48,8 +54,9 @@ def registered():
     gymnasium.register("forbes/Needy-v0", entry_point=needs_another_package)
     gymnasium.register("forbes/Camera-v0", entry_point=Camera)
     gymnasium.register("forbes/Levers-v0", entry_point=Levers)
+    gymnasium.register("forbes/Given-v0", entry_point=toy_gymnasium.Given, disable_env_checker=True)
     yield
-    for name in ("Camera", "Levers", "Needy"):
+    for name in ("Camera", "Given", "Levers", "Needy"):
         del gymnasium.registry[f"forbes/{name}-v0"]
 
 
@@ -111,6 +118,7 @@ def test_pixels_are_what_it_draws_made_smaller():
     ("task", "sentence"),
     [
         ("Pendulm-v1", "Pendulm-v1: gymnasium has no such environment. Did you mean Pendulum-v1"),
+        ("toy_gymnasium:Toy-Room-v0", "gymnasium has no such environment. Did you mean Toy-Rooms-v0"),
         ("no_such_package:Thing-v0", "no_such_package:Thing-v0: gymnasium has no such environment"),
         ("forbes/Needy-v0", "forbes/Needy-v0: Box2D is not installed"),
         ("forbes/Levers-v0", "its actions are a MultiDiscrete, expected a Box or a Discrete. Wrap it"),
@@ -121,3 +129,151 @@ def test_what_cannot_be_used_is_one_sentence(task, sentence):
         Gymnasium(task)
     assert sentence in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def environment_of(monkeypatch, space=None, value=0, actions=None, **options):
+    """The environment that shows a value of a space, or takes an action of one."""
+    given = {"space": space or Discrete(2), "value": value, "action_space": actions}
+    monkeypatch.setattr(gymnasium.registry["forbes/Given-v0"], "kwargs", given)
+    return Gymnasium("forbes/Given-v0", **options)
+
+
+ONE_SIDED = {
+    "below": Box(0.0, np.inf, (2,)),
+    "above": Box(-np.inf, -3.0, (2,)),
+    "both": Box(np.array([-1.0, 2.0], np.float32), np.array([7.0, np.inf], np.float32)),
+    "none": Box(-np.inf, np.inf, (2,)),
+    "integers below": Box(5, np.inf, (2,), np.int64),
+    "integers": Box(-3, 3, (2,), np.int8),
+}
+
+
+@pytest.mark.parametrize("bounds", ONE_SIDED)
+def test_every_action_lies_within_its_box(bounds, monkeypatch):
+    environment = environment_of(monkeypatch, actions=ONE_SIDED[bounds])
+    for action in np.random.default_rng(0).uniform(-1, 1, (200, 2)).astype(np.float32):
+        environment.step(action)  # the toy refuses what its space does not contain
+    for corner in (-1, 1):
+        environment.step(np.full(2, corner, np.float32))
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 3), (-2, 1), (-2, 2), (4, 4)])
+def test_whole_numbers_of_a_box_are_drawn_alike(low, high, monkeypatch):
+    """Each of n numbers is what a share 1/n of [-1, 1] means: on an even grid, the counts are equal."""
+    environment = environment_of(monkeypatch, actions=Box(low, high, (1,), np.int32))
+    numbers = np.arange(low, high + 1)
+    grid = (np.arange(60 * len(numbers)) + 0.5) / (30 * len(numbers)) - 1
+
+    taken = []
+    for action in grid:
+        environment.step(np.array([action], np.float32))
+        taken.append(environment._environment.unwrapped.taken.item())
+
+    found, counts = np.unique(taken, return_counts=True)
+    np.testing.assert_array_equal(found, numbers)
+    np.testing.assert_array_equal(counts, 60)
+    environment.step(np.ones(1, np.float32))
+    assert environment._environment.unwrapped.taken == high
+
+
+@pytest.mark.parametrize("shape", [(84, 84), (84, 84, 1), (20, 30, 3), (4, 84, 84)])
+def test_image_spaces_are_images_with_channels_first(shape, monkeypatch):
+    value = np.random.default_rng(0).integers(256, size=shape, dtype=np.uint8)
+    first = {(84, 84): value[None], (4, 84, 84): value}.get(shape, np.moveaxis(value, -1, 0))
+
+    whole = environment_of(monkeypatch, Box(0, 255, shape, np.uint8), value)
+    small = environment_of(monkeypatch, Box(0, 255, shape, np.uint8), value, size=10)
+
+    np.testing.assert_array_equal(whole.reset(0).observation, first)
+    check_step(whole.reset(0), whole.observation_shape)
+    assert small.observation_shape == (len(first), 10, 10)
+    assert abs(small.reset(0).observation.mean() - value.mean()) < 2
+
+
+def test_a_smaller_image_is_the_mean_of_what_each_pixel_covers(monkeypatch):
+    value = np.arange(48, dtype=np.uint8).reshape(4, 4, 3) * 4  # steps of 4: means are whole numbers
+
+    environment = environment_of(monkeypatch, Box(0, 255, (4, 4, 3), np.uint8), value, size=2)
+
+    expected = value.reshape(2, 2, 2, 2, 3).mean((1, 3)).transpose(2, 0, 1)
+    np.testing.assert_array_equal(environment.reset(0).observation, expected)
+
+
+def test_parts_come_one_after_the_other_and_whole_numbers_are_scaled(monkeypatch):
+    space = Tuple((Box(-9.0, 9.0, (2,)), Box(10, 20, (2,), np.int64), Dict(b=MultiDiscrete([2, 3]), a=Text(9))))
+    value = (np.array([-8.0, 0.5], np.float32), np.array([10, 15]), {"a": "word", "b": np.array([1, 0])})
+
+    seen = environment_of(monkeypatch, space, value).reset(0).observation
+
+    assert seen.tolist() == [-8.0, 0.5, 0.0, 0.5, 0, 1, 1, 0, 0]
+    assert seen.dtype == np.float32
+
+
+def test_bytes_of_a_memory_are_scaled_and_numbers_without_bounds_are_not(monkeypatch):
+    memory = np.array([0, 51, 255], np.uint8)
+    assert environment_of(monkeypatch, Box(0, 255, (3,), np.uint8), memory).reset(0).observation.tolist() == [
+        0,
+        np.float32(0.2),
+        1,
+    ]
+    count = np.array([7])
+    assert environment_of(monkeypatch, Box(0, np.inf, (1,), np.int64), count).reset(0).observation.tolist() == [7]
+
+
+def test_a_package_that_registers_as_minigrid_does_is_collected(tmp_path):
+    folder = tmp_path / "rooms"
+    collect = ["data", "collect", "--task", "gymnasium:toy_gymnasium:Toy-Rooms-v0", "--episodes", "2"]
+
+    assert main([*collect, "-o", str(folder)]) == 0
+
+    episode = EpisodeStore(folder).episode(1)
+    assert episode.observation.shape == (5, 4 + 7 * 7 * 3)
+    np.testing.assert_array_equal(episode.observation[:, :4], np.eye(4)[[2] * 5])
+    np.testing.assert_array_equal(episode.observation[:, 4:], np.float32(51 / 255))
+
+
+def test_an_entry_of_a_dict_may_be_all_that_is_observed():
+    environment = find_environment("gymnasium:toy_gymnasium:Toy-Rooms-v0", part="image", size=28)()
+
+    assert environment.observation_shape == (3, 28, 28)
+    assert (environment.reset(0).observation == 51).all()
+    assert environment.describe()["part"] == "image"
+
+
+def test_the_help_names_a_task_of_a_package(capsys):
+    with pytest.raises(SystemExit):
+        main(["data", "collect", "--help"])
+    assert "gymnasium:minigrid:MiniGrid-Empty-5x5-v0" in capsys.readouterr().out
+
+
+NODES = Graph(Box(-1.0, 1.0, (2,)), None)
+
+
+@pytest.mark.parametrize(
+    ("space", "sentence"),
+    [
+        (Sequence(Discrete(3)), "its observations have a Sequence, expected images, or numbers in Box"),
+        (NODES, "its observations have a Graph"),
+        (Tuple((Discrete(2), Sequence(Discrete(3)))), "its observations have a Sequence"),
+        (Dict(a=Discrete(2), b=NODES), "its observations have a Graph"),
+        (OneOf((Discrete(2), Discrete(3))), "its observations have a OneOf"),
+        (Text(5), "its observations are text, expected numbers or images"),
+    ],
+)
+def test_a_space_that_is_no_array_is_refused_by_name(space, sentence, monkeypatch):
+    with pytest.raises(ForbesError, match="registers it, and name that: gymnasium:MODULE:ID") as error:
+        environment_of(monkeypatch, space)
+    assert sentence in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"pixels": True}, "it draws no pictures (render_mode rgb_array), expected them for pixels. Leave pixels out"),
+        ({"part": "image"}, "part is 'image', expected one of a Dict"),
+    ],
+)
+def test_an_option_the_environment_lacks_is_one_sentence(options, sentence, monkeypatch):
+    with pytest.raises(ForbesError) as error:
+        environment_of(monkeypatch, **options)
+    assert sentence in str(error.value)

@@ -167,3 +167,66 @@ def test_a_script_without_a_guard_is_told_what_it_lacks(tmp_path):
 
     assert done.returncode != 0
     assert 'keep its commands under `if __name__ == "__main__":`' in done.stderr.splitlines()[-1]
+
+
+NOTEBOOK = """
+import functools
+from forbes.envs import EnvironmentProcess
+from forbes.errors import ForbesError
+from toy_environments import Echo
+class Room(Echo):
+    pass
+def furnish(steps, kind):
+    return kind(steps)
+for make in (Room, functools.partial(Room, 3), functools.partial(furnish, 3, Echo)):
+    try:
+        EnvironmentProcess(make)
+    except ForbesError as error:
+        print(error)
+with EnvironmentProcess(Echo) as environment:
+    print(environment.action_dim)
+"""
+NAMES = ("Room", "Room", "furnish")
+
+
+def assert_told_to_move(name, sentence):
+    assert sentence.startswith(f"{name}: it is defined in a notebook or on standard input, which")
+    assert sentence.endswith("Define it at the top of a module file, and import it from there")
+
+
+def run_notebook(*flags, stdin=None):
+    """Run the commands where `__main__` is no file; their output, and that nothing is on standard error."""
+    environ = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    return subprocess.run([sys.executable, *flags], input=stdin, capture_output=True, text=True, env=environ)
+
+
+def test_a_class_of_a_notebook_is_told_to_move_to_a_module_file():
+    done = run_notebook("-c", NOTEBOOK)  # as in a notebook, `__main__` has no file, and an imported class can be used
+
+    *refused, action_dim = done.stdout.splitlines()
+    for name, sentence in zip(NAMES, refused, strict=True):
+        assert_told_to_move(name, sentence)
+    assert action_dim == "1"
+    assert done.stderr == ""
+
+
+def test_a_script_on_standard_input_is_told_to_move_to_a_file():
+    done = run_notebook(stdin=NOTEBOOK)
+
+    for name, sentence in zip(NAMES, done.stdout.splitlines(), strict=True):
+        assert_told_to_move(name, sentence)
+    assert done.stderr.splitlines()[-1].endswith(
+        "Echo: commands on standard input cannot start the process of an environment, which reads them again. "
+        "Write them to a file"
+    )
+
+
+def test_what_cannot_be_sent_to_another_process_is_one_sentence():
+    class Local(Echo):
+        pass
+
+    for make in (Local, lambda: Echo()):
+        with pytest.raises(
+            ForbesError, match=r"it cannot be sent to another process .* Define it at the top of a module"
+        ):
+            EnvironmentProcess(make)

@@ -9,6 +9,7 @@ from matplotlib.colors import to_hex
 from small_agents import fit, write_config
 
 from forbes.cli import main
+from forbes.errors import ForbesError
 from forbes.figures.returns import returns_against_env_steps
 from forbes.figures.style import BLUE, ORANGE
 
@@ -41,6 +42,20 @@ def test_seeds_meet_at_all_steps_that_all_have_reached():
     assert [to_hex(line.get_color()) for line in (forbes, dreamer)] == [BLUE, ORANGE]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["forbes, 2 seeds", "dreamer"]
     assert axes.get_title() == "hike"
+
+
+def test_an_agent_that_was_measured_once_is_a_dot():
+    one = pd.Series({10: 3.0})
+
+    axes = returns_against_env_steps("hike", {"forbes": [one], "dreamer": [one, one + 1]}).axes[0]
+
+    assert [line.get_marker() for line in axes.lines] == ["o", "o"]
+    np.testing.assert_allclose([line.get_ydata() for line in axes.lines], [[3.0], [3.5]])
+
+
+def test_curves_without_a_common_step_are_one_sentence():
+    with pytest.raises(ForbesError, match="forbes: no step was reached by all its 2 seeds"):
+        returns_against_env_steps("hike", {"forbes": [pd.Series({10: 3.0}), pd.Series({11: 3.0})]})
 
 
 def test_folders_that_differ_in_the_number_are_seeds(runs, tmp_path, capsys):

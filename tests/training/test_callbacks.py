@@ -8,10 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from PIL import Image
 
 from forbes.cli import main
+from forbes.figures.style import BLACK, BLUE, ORANGE
 from forbes.training.callbacks import BeliefPlot, ElboCurve, PredictionGrid
 from forbes.training.callbacks.belief_plot import _kernel_density, _principal_plane
 from forbes.training.callbacks.parameter_count import count_parameters
@@ -203,6 +206,23 @@ def test_a_belief_in_the_plane_is_drawn_with_its_exact_density(tiny_run):
     assert density[-1, -1] == pytest.approx(expected, rel=1e-4)
     area = (right - left) * (top - bottom)
     assert 0.9 < density.mean() * area < 1.05  # the frame holds nearly all of the belief
+
+
+def test_the_legend_of_beliefs_names_each_colour_that_is_drawn(tiny_run):
+    figure = draw(BeliefPlot(digits=2, columns=2, samples=60), tiny_run)
+
+    (legend,) = figure.subfigs[0].legends
+    names = {
+        to_hex(handle.get_facecolor() if isinstance(handle, Patch) else handle.get_color()): text.get_text()
+        for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=True)
+    }
+    drawn = {to_hex(line.get_color()) for axes in figure.axes for line in axes.lines}
+    assert drawn == {BLACK, BLUE}
+    assert names.keys() == {ORANGE, BLUE, BLACK}
+    figure.canvas.draw()
+    box = legend.get_window_extent()
+    assert not [axes for axes in figure.axes if axes.get_tightbbox().overlaps(box)]
+    assert box.x0 >= 0 <= figure.bbox.width - box.x1
 
 
 def test_a_belief_of_more_dimensions_is_projected_on_the_priors_principal_plane():

@@ -6,8 +6,11 @@ from typing import NamedTuple
 
 import torch
 from lightning import LightningModule, Trainer
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from torch import Tensor
 
 from forbes.beliefs import BeliefHead
@@ -64,8 +67,11 @@ class BeliefPlot(PictureCallback):
         prior_context = model.prior_context(filtered.hidden)  # (B, T, C)
         times = torch.linspace(0, data.length - 1, self.columns).round().long().unique().tolist()
         with paper_style():
-            figure = Figure((PAGE, 3.3 * len(index)))
-            for digit, part in enumerate(figure.subfigures(len(index), 1, squeeze=False).flat):
+            heights = (0.3, *[3.3] * len(index))
+            figure = Figure((PAGE, sum(heights)))
+            head, *parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat
+            head.legend(handles=_legend(), loc="center", ncols=4)
+            for digit, part in enumerate(parts):
                 rows = part.subplots(3, len(times), squeeze=False, gridspec_kw={"wspace": 0.3, "hspace": 0.22})
                 part.subplots_adjust(left=0.06, right=0.97, bottom=0.11, top=0.95)
                 for column, time in enumerate(times):
@@ -126,6 +132,15 @@ def _draw_cloud(axes: Axes, cloud: _Cloud, colour: str, shown: Tensor) -> None:
     axes.locator_params(nbins=3)
     axes.tick_params(labelsize=5, length=2, pad=1)
     axes.grid(False)
+
+
+def _legend() -> list[Artist]:
+    """Say what the colours are."""
+    samples = (
+        Line2D([], [], color=colour, label=label, linestyle="", marker=".", markersize=4)
+        for colour, label in ((BLACK, "samples of the density"), (BLUE, "samples of the posterior"))
+    )
+    return [Patch(color=ORANGE, label="prior, density"), Patch(color=BLUE, label="posterior, density"), *samples]
 
 
 def _draw_frame(axes: Axes, observation: Tensor, title: str) -> None:

@@ -1,0 +1,118 @@
+"""From the spaces of Gymnasium to the arrays that an `Environment` gives and takes; only this imports gymnasium."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from forbes.envs.base import finite_bounds, scale_action
+from forbes.errors import ForbesError
+
+__all__ = ["flatten", "is_image", "require_actions", "require_observations", "to_action", "to_image"]
+
+_FLAT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_CHANNELS = (1, 3, 4)
+_REGISTER = "Wrap it in a module of your own that registers it, and name that: gymnasium:MODULE:ID"
+
+
+def is_image(space: Any) -> bool:
+    """Tell whether a space is a uint8 Box of 0 to 255, `(H, W)` or of 1, 3 or 4 channels, first or last."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
+        return False
+    channels = len(space.shape) == 2 or space.shape[0] in _CHANNELS or space.shape[-1] in _CHANNELS
+    return channels and bool((space.low == 0).all() and (space.high == 255).all())
+
+
+def to_image(pixels: Any, size: int | None = None) -> NDArray[np.uint8]:
+    """Return pixels `(H, W)`, `(H, W, C)` or `(C, H, W)` as uint8 `(C, H, W)`.
+
+    Args:
+        pixels: the image, uint8.
+        size: pixels a side, each the mean of those it covers; None keeps them all.
+    """
+    image = np.atleast_3d(pixels)  # (H, W, C) or (C, H, W)
+    if image.shape[-1] in _CHANNELS:
+        image = image.transpose(2, 0, 1)  # (C, H, W)
+    if size is not None and image.shape[1:] != (size, size):
+        from PIL import Image
+
+        small = (Image.fromarray(channel).resize((size, size), Image.Resampling.BOX) for channel in image)
+        image = np.stack([np.asarray(channel) for channel in small])  # (C, size, size)
+    return np.ascontiguousarray(image)
+
+
+def flatten(space: Any, value: Any) -> NDArray[np.float32]:
+    """Return a value of a space as a vector, float32 `(O,)`.
+
+    It is what `gymnasium.spaces.flatten` makes of it, except that whole numbers of a Box with two bounds are scaled
+    to [0, 1], and that text is left out.
+    """
+    if isinstance(space, spaces.Dict):
+        return np.concatenate([flatten(part, value[name]) for name, part in space.spaces.items()])
+    if isinstance(space, spaces.Tuple):
+        return np.concatenate([flatten(part, each) for part, each in zip(space.spaces, value, strict=True)])
+    if _is_text(space):
+        return np.empty(0, np.float32)
+    flat = np.asarray(spaces.flatten(space, value))  # (O,)
+    if isinstance(space, spaces.Box) and flat.dtype.kind in "iu":
+        low, high = _bounds(space)
+        bounded = np.isfinite(high - low)
+        flat = np.where(bounded, (flat - low) / np.where(bounded & (high > low), high - low, 1), flat)
+    return flat.astype(np.float32)
+
+
+def require_observations(task: str, space: Any) -> None:
+    """Raise a ForbesError unless `flatten` takes every part of a space."""
+    for part in _parts(space):
+        if not isinstance(part, _FLAT) and not _is_text(part):
+            raise ForbesError(
+                f"{task}: its observations have a {type(part).__name__}, expected images, or numbers in Box, Discrete, "
+                f"MultiDiscrete, MultiBinary, Tuple and Dict. {_REGISTER}"
+            )
+    if all(_is_text(part) for part in _parts(space)):
+        raise ForbesError(f"{task}: its observations are text, expected numbers or images. {_REGISTER}")
+
+
+def require_actions(task: str, space: Any) -> None:
+    """Raise a ForbesError unless `to_action` gives what a space holds."""
+    if not isinstance(space, spaces.Box | spaces.Discrete):
+        kind = type(space).__name__
+        raise ForbesError(f"{task}: its actions are a {kind}, expected a Box or a Discrete. {_REGISTER}")
+
+
+def to_action(space: Any, action: NDArray[np.float32]) -> Any:
+    r"""Return the member of a Box or a Discrete that an action means, float32 `(A,)` in [-1, 1] or one-hot.
+
+    Reals of a Box are `scale_action`; whole numbers from l to h have equal shares of [-1, 1]:
+
+    .. math:: \min(h, \lfloor l + (a + 1)(h - l + 1) / 2 \rfloor)
+    """
+    if isinstance(space, spaces.Discrete):
+        return space.start + action.argmax()
+    low, high = finite_bounds(*_bounds(space))
+    if space.dtype.kind == "f":
+        scaled = scale_action(action, low, high)
+    else:
+        scaled = np.minimum(np.floor(scale_action(action, low, high + 1)), high)
+    return scaled.reshape(space.shape).astype(space.dtype)
+
+
+def _bounds(space: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return low and high of a Box, `(O,)`; a missing bound is infinite, of integers too."""
+    low = np.where(space.bounded_below, space.low, -np.inf).ravel().astype(np.float64)
+    high = np.where(space.bounded_above, space.high, np.inf).ravel().astype(np.float64)
+    return low, high
+
+
+def _is_text(space: Any) -> bool:
+    """Tell whether a space holds text; packages have classes of their own for it, as MiniGrid for its mission."""
+    return space.dtype is not None and space.dtype.kind == "U"
+
+
+def _parts(space: Any) -> list[Any]:
+    """List what the Dicts and Tuples of a space are made of."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        members = space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
+        return [part for member in members for part in _parts(member)]
+    return [space]

@@ -1,0 +1,27 @@
+"""How a record of tensors is printed: by the shape and dtype of each, not by its thousands of numbers."""
+
+from typing import Any, TypeVar
+
+__all__ = ["printed_by_shape"]
+
+Record = TypeVar("Record")
+
+
+def printed_by_shape(record: type[Record]) -> type[Record]:
+    """Let a NamedTuple of tensors or arrays print as `Batch(observation=uint8 (2, 30, 1, 28, 28), ...)`."""
+
+    def __repr__(self: Any) -> str:  # noqa: N807
+        fields = (f"{name}={_summary(getattr(self, name))}" for name in self._fields)
+        return f"{type(self).__name__}({', '.join(fields)})"
+
+    record.__repr__ = __repr__  # type: ignore[method-assign]
+    return record
+
+
+def _summary(value: Any) -> str:
+    """Return dtype, shape and device, if it is not the CPU, of a tensor or an array; else the value's own repr."""
+    if not hasattr(value, "shape"):
+        return repr(value)
+    device = str(getattr(value, "device", "cpu"))
+    place = "" if device == "cpu" else f" on {device}"
+    return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}{place}"
