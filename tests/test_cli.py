@@ -167,7 +167,7 @@ def error_of(capsys, *arguments):
             "no class PredictionGri that fits here, did you mean PredictionGrid?",
         ),
         (["--model.learning_rate", "fast"], "model.learning_rate: is fast, expected float"),
-        (["--model.kl", "exact"], "model.kl: is exact, expected one of ['analytic', 'monte_carlo']"),
+        (["--model.kl", "exact"], "model.kl: is exact, expected one of ['analytic', 'monte_carlo', 'path']"),
         (["--trainer.max_epochs", "many"], "trainer.max_epochs: is many, expected int or null"),
         (["--data.length", "0"], "length is 0, expected at least 1"),
         (["--model.learning_rate", "null"], "learning_rate is None, expected at least 0"),
