@@ -192,7 +192,7 @@ def test_a_density_and_a_context_broadcast_either_way():
 
 
 def test_splits_a_one_dimensional_belief_into_two_narrow_modes():
-    """Fitted to N(±1, 0.1²) it comes within 0.05 nats; the Gaussian of that spread has 1.6. A layer's slope is bounded."""
+    """Fitted to N(±1, 0.1²) it comes within 0.05 nats; the Gaussian of that spread has 1.6."""
     torch.manual_seed(0)
     belief, context = FlowBelief(1, 1, layers=3, width=16, coupling="spline"), torch.ones(1)
     optimizer = torch.optim.Adam(belief.parameters(), lr=1e-2)
