@@ -65,9 +65,10 @@ def model_round_trip(model: BeliefModel, batch: SequenceBatch, seed: int) -> dic
 
 
 def print_round_trip(run: str, found: dict[str, dict[str, float]]) -> None:
-    """Print what `model_round_trip` has found for a run, and a warning where scores cannot be trusted to `LIMIT`."""
+    """Print to stderr what `model_round_trip` has found for a run, with a warning where it is above `LIMIT`."""
     for name, errors in found.items():
-        print(f"{run}: {name} flow, round trip: state {errors['state']:.1e}, log-density {errors['log_prob']:.1e} nats")
+        told = f"state {errors['state']:.1e}, log-density {errors['log_prob']:.1e} nats"
+        print(f"{run}: {name} flow, round trip: {told}", file=sys.stderr)
     if any(not errors["log_prob"] <= LIMIT for errors in found.values()):
         print(
             f"WARNING: {run}: the inverse of its flow loses more than {LIMIT:g} nats in float32, so its KL, bounds and "

@@ -58,7 +58,9 @@ def evaluate(*arguments):
 
 
 def record(run):
-    return json.loads((RunFolder(run).path / "evaluation.json").read_text())
+    """Its scores; the round trip of its flows has tests of its own."""
+    entries = json.loads((RunFolder(run).path / "evaluation.json").read_text())
+    return {name: entry for name, entry in entries.items() if not name.endswith("/round_trip")}
 
 
 def record_is_missing(run):

@@ -69,7 +69,7 @@ def test_a_disagreement_above_the_limit_is_told_loudly(capsys, error, loud):
     print_round_trip("runs/one", {"prior": {"state": 0.0, "log_prob": error}})
 
     said = capsys.readouterr()
-    assert "runs/one: prior flow, round trip" in said.out
+    assert "runs/one: prior flow, round trip" in said.err
     assert ("WARNING: runs/one" in said.err) == loud
 
 
@@ -82,4 +82,4 @@ def test_evaluate_records_the_round_trip_of_a_flow(tiny_run, tmp_path, capsys):
     entry = json.loads((run / "evaluation.json").read_text())["test/round_trip"]
     assert {*entry} == {"prior", "posterior", "sequences", "seed"}
     assert entry["posterior"]["log_prob"] < LIMIT
-    assert "posterior flow, round trip" in capsys.readouterr().out
+    assert "posterior flow, round trip" in capsys.readouterr().err
