@@ -47,7 +47,7 @@ class SequenceSource(Named, ABC):
     discrete: bool = False
     """Whether an action is one of A, as a one-hot vector."""
     increments: bool = False
-    """Whether o_t is what step t adds to a picture, not the picture itself: then pictures show the sum up to t."""
+    """Whether o_t is what step t adds to a picture, pixels of 0 and 1, not the picture itself."""
     watermark: int | None = None
     """Up to where a source that grows was read; a checkpoint keeps it, and a resumed run sets it again."""
 
@@ -87,6 +87,17 @@ class SequenceSource(Named, ABC):
             )
         turn, place = divmod(update, size // batch_size)
         return _order(seed, turn, size)[place * batch_size : (place + 1) * batch_size]  # (B,)
+
+    def pictures(self, observation: Tensor) -> Tensor:
+        r"""Return what a person is shown of observations from the first step on, `(B, T, *O)`.
+
+        Increments add up: a pixel is on that any step so far has put on. Of probabilities it is how likely that is,
+
+        .. math:: \text{picture}_t = 1 - \prod_{u \le t} (1 - x_u)
+        """
+        if not self.increments:
+            return observation
+        return 1 - (1 - observation).cumprod(1, dtype=observation.dtype)
 
     def latest(self, count: int) -> Tensor:
         """Give training sequences to look at, those first that were learned from least; int64 `(count,)` or fewer."""

@@ -77,6 +77,7 @@ class Strokes(SequenceSource):
         self.path = path
         self.points_per_step = points_per_step
         self.validation = validation
+        self.frames = frames
         self.increments = frames == "written"
 
     @cached_property

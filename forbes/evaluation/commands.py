@@ -9,13 +9,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
+from torch import Tensor
+
 from forbes.arguments import ArgumentParser, positive
 from forbes.data import Simulated, Split
 from forbes.errors import ForbesError
 from forbes.evaluation.agents import add_acting_samples, evaluate_agents, is_agent
-from forbes.evaluation.measured import Measured, note, pair
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.measured import SCORES, Measured, note, pair
 from forbes.evaluation.progress import with_progress
 from forbes.evaluation.record import describe, read_record, write_record
+from forbes.evaluation.references import references
 from forbes.evaluation.runs import (
     TrainedRun,
     data_name,
@@ -26,7 +30,7 @@ from forbes.evaluation.runs import (
     split_batches,
 )
 from forbes.evaluation.scoring import PASSES, Parts, Pass, exact_pass, make_pass, score_split
-from forbes.evaluation.tables import print_degradation, print_pairs, print_runs
+from forbes.evaluation.tables import print_degradation, print_pairs, print_references, print_runs
 from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
@@ -38,7 +42,7 @@ _DESCRIPTION = f"""\
 Measure trained models by bounds and proper scores, and compare them on the same sequences.
 
   forbes evaluate runs/compare/forbes-0 runs/compare/rssm-0
-  forbes evaluate runs/compare/forbes-0 --scores elbo pll --digits 200
+  forbes evaluate runs/compare/forbes-0 --scores elbo pll --sequences 200
   forbes evaluate runs/agent/forbes-0 runs/agent/dreamer-0 --episodes 20
 
 Nats per sequence of observations, fully normalised, without free nats; the KL is the Monte-Carlo estimate for every
@@ -72,7 +76,8 @@ commonest), not that of one, which is the paper's: no training is needed for it,
 it can be worth much, or cost as much.
 
 On digit strokes and one core, elbo takes some 4 minutes a run, pll 5, fivo 3, and open-loop 20, in proportion to
---futures and --digits."""
+--futures and --sequences. Beside each score stands what models without a belief have on the same sequences, of
+strokes 1- to 5-grams of pen moves, of images the last frame and the mean frame; a run below one of them is marked."""
 
 
 class _Job(NamedTuple):
@@ -95,6 +100,7 @@ def main(argv: Sequence[str]) -> None:
         )
     measured = evaluate(args.runs, args, command)
     print_runs(measured)
+    print_references(measured)
     if len(measured) > 1:
         print_pairs(pair(measured))
     print_degradation(measured)
@@ -118,6 +124,7 @@ def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
         one = Measured(run, {}, {})
         for job in _of(run, jobs):
             finished.append(_measure(one, job, job.sha256[number], args))
+        _add_references(one, jobs, args.split)
         for entry in one.entries.values():
             date = datetime.now(UTC).isoformat(timespec="seconds")
             entry.update(command=command, commit=commit(), seed=args.seed, date=date, parameters=run.parameters)
@@ -129,6 +136,20 @@ def evaluate(paths: Sequence[str], args: Any, command: str) -> list[Measured]:
     for parts in finished:
         parts.remove()
     return measured
+
+
+def _add_references(one: Measured, jobs: Sequence[_Job], split: Split) -> None:
+    """Put beside each score what references have on the same steps of the same sequences."""
+    found: dict[int, dict[str, Tensor]] = {}
+    for job in _of(one.run, jobs):
+        scores = [metric for metric in job.score.metrics if metric in SCORES]
+        if scores and job.sequences not in found:
+            found[job.sequences] = references(one.run.data, one.run.model.likelihood, split, job.sequences)
+        for metric in scores:
+            one.entries[_metric_name(one.run, job, metric, split)]["references"] = {
+                name: Estimate.of(values[:, job.score.context :].sum(1))._asdict()
+                for name, values in found[job.sequences].items()
+            }
 
 
 def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[dict[str, bool]]:
@@ -158,7 +179,10 @@ def add_score_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--scores", nargs="+", choices=PASSES, default=PASSES, help="default: all")
     parser.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
     parser.add_argument(
-        "--digits", type=_all_or_number, default=None, help="all, or only the first so many, for every score"
+        *("--sequences", "--digits"),
+        type=_all_or_number,
+        default=None,
+        help=f"all, or only the first so many, for every score (default: all for elbo, {_SUBSET} for the others)",
     )
     parser.add_argument("--samples", type=positive, default=16, help="S of the ELBO (default: 16)")
     parser.add_argument("--particles", type=positive, default=128, help="K of PLL, IWAE and FIVO (default: 128)")
@@ -224,11 +248,14 @@ def _of(run: TrainedRun, jobs: Sequence[_Job]) -> list[_Job]:
 def _count(run: TrainedRun, args: Any, default: int) -> int:
     """Give the number of sequences to score."""
     size = run.data.source.size(args.split)
-    wanted = min(default, size) if args.digits is None else args.digits
+    wanted = min(default, size) if args.sequences is None else args.sequences
     if sys.maxsize > wanted > size:
-        raise ForbesError(f"--digits {wanted}: the {args.split} split of {run.path} has {size} sequences. Choose fewer")
+        raise ForbesError(
+            f"--sequences {wanted}: the {args.split} split of {run.path} has {size} sequences. Choose fewer"
+        )
     if (count := min(wanted, size)) < 2:
-        raise ForbesError(f"--digits {count}: a standard error needs at least 2 sequences. Choose more")
+        where = f"the {args.split} split of {run.path}" if size < 2 else f"--sequences {count}"
+        raise ForbesError(f"{where}: a standard error needs at least 2 sequences, found {count}. Choose more")
     return count
 
 

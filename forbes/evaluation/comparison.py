@@ -45,6 +45,8 @@ class Comparison(NamedTuple):
     both have it."""
     curves: dict[str, dict[str, list[float]]]
     """By metric and family that has it, the mean of each step over sequences and seeds; of the `degradation` too."""
+    references: dict[str, dict[str, float]]
+    """By score and name, what models without a belief have on the same sequences."""
 
 
 def compare(families: Sequence[Family], metrics: Sequence[str]) -> Comparison:
@@ -54,6 +56,7 @@ def compare(families: Sequence[Family], metrics: Sequence[str]) -> Comparison:
         ForbesError: where a run lacks a metric, or was measured on other sequences than the first.
     """
     rows, curves = [], {}
+    references: dict[str, dict[str, float]] = {}
     for metric in metrics:
         having = [family for family in families if metric not in family.lacks]
         entries = {family.name: _entries(family, metric) for family in having}
@@ -61,6 +64,8 @@ def compare(families: Sequence[Family], metrics: Sequence[str]) -> Comparison:
         curves[metric] = {
             name: np.mean([entry["curve"] for entry in of_runs], axis=0).tolist() for name, of_runs in entries.items()
         }
+        found = next(iter(entries.values()))[0].get("references", {})
+        references |= {metric: {name: each["mean"] for name, each in found.items()}} if found else {}
         for family in families:
             own = entries.get(family.name) or [_blank(entries[having[0].name][0])] * len(family.runs)
             rows += [_row(family, metric, seed, entry) for seed, entry in zip(family.runs, own, strict=True)]
@@ -69,7 +74,7 @@ def compare(families: Sequence[Family], metrics: Sequence[str]) -> Comparison:
     others = [(metric, other) for metric in scores for other in families[1:] if metric not in other.lacks]
     differences = [difference for metric, other in others for difference in _paired(other, families[0], metric)]
     columns = ["family", "metric", "seed", "mean", "standard_error"]
-    return Comparison(pd.DataFrame(rows), pd.DataFrame(differences, columns=columns), curves)
+    return Comparison(pd.DataFrame(rows), pd.DataFrame(differences, columns=columns), curves, references)
 
 
 def _entries(family: Family, metric: str) -> list[dict[str, Any]]:
@@ -132,7 +137,16 @@ def markdown(comparison: Comparison, families: Sequence[Family]) -> str:
     lines += _table(["metric", *names], [["parameters", *parameters]])
     for metric in metrics:
         column = "per_step" if score_of(metric) == "ess" else "mean"
-        lines += _rows([[f"`{metric}`", *(_span(scores.loc[[(metric, name)], column].tolist()) for name in names)]])
+        of_families = [scores.loc[[(metric, name)], column].tolist() for name in names]
+        lines += _rows(
+            [[f"`{metric}`", *(_span(v) + _below(v, comparison.references.get(metric, {})) for v in of_families)]]
+        )
+    if comparison.references:
+        lines += ["", "Models without a belief on the same steps; <: the mean over seeds is below this one.", ""]
+        of_references = next(iter(comparison.references.values()))
+        lines += _table(["metric", *of_references], [])
+        for metric, means in comparison.references.items():
+            lines += _rows([[f"`{metric}`", *(f"{mean:.2f}" for mean in means.values())]])
     if len(comparison.differences):
         lines += ["", f"Paired over sequences, minus {names[0]}: mean ± standard error.", ""]
         differences = comparison.differences.set_index(["metric", "family", "seed"])
@@ -141,13 +155,19 @@ def markdown(comparison: Comparison, families: Sequence[Family]) -> str:
         for metric in comparison.differences["metric"].unique():
             each = [_difference(differences, (metric, *pair)) for pair in pairs]
             lines += _rows([[f"`{metric}`", *each]])
-    for metric, of_families in comparison.curves.items():
+    for metric, curves in comparison.curves.items():
         if score_of(metric) == "degradation":
-            rows = at_horizons(metric, of_families)
+            rows = at_horizons(metric, curves)
             lines += ["", f"`{metric}`: nats a prediction loses so many steps after the last one seen.", ""]
             lines += _table(["steps", *map(str, next(iter(rows.values())))], [])
             lines += _rows([[name, *(f"{loss:.2f}" for loss in row.values())] for name, row in rows.items()])
     return "\n".join(lines) + "\n"
+
+
+def _below(values: Sequence[float], references: Mapping[str, float]) -> str:
+    """Name the lowest reference above the mean of some values."""
+    above = [(mean, name) for name, mean in references.items() if mean > statistics.fmean(values)]
+    return f" < {min(above)[1]}" if above else ""
 
 
 def _difference(differences: pd.DataFrame, of: tuple[str, str, int]) -> str:

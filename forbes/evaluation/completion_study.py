@@ -89,14 +89,14 @@ def study(
 
     classes = prefixes.reference
     error = calibration_error(classes, prefixes.labels)
-    own = model_pass(context, samples, length, judges)
+    own = model_pass(data, context, samples, judges)
     return Study(
         prefixes,
         samples,
         Row("reference", None, summarise_classes(classes, prefixes), error, classes),
         [measure(name, run.path, run, own) for name, run in runs.items()],
         measure("similar digits", None, first, neighbour_pass(data, context, samples, judges)),
-        measure("true digits", None, first, truth_pass(context, length, judges)),
+        measure("true digits", None, first, truth_pass(data, context, judges)),
     )
 
 

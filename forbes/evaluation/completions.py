@@ -8,7 +8,8 @@ learn no sign of the end, so at a later step they would have drawn on. With the 
 .. math:: p(y \mid o_{1:c}) = \frac1N \sum_k p_{\text{finished}}(y \mid x^k_n)
           \qquad\text{against}\qquad r(y \mid o_{1:c}) = p_{\text{prefix}}(y \mid o_{1:c})
 
-Grey values are read as they are; where a score is about observations, those are drawn from them pixel by pixel.
+Of written strokes a completion is a drawing, one pixel a step; of whole frames it is a picture in grey. Grey values are
+read as they are; where a score is about observations, those are drawn from them pixel by pixel.
 """
 
 from collections.abc import Iterator
@@ -87,7 +88,7 @@ def prefixes(data: SequenceDataModule, split: Split, digits: int, context: int, 
             f"--prefixes {context}: of {digits} digits {len(index)} go on after {context} steps, expected at least 2. "
             "Choose a smaller prefix, or more digits"
         )
-    observation = data.sequences(split, index, context).observation
+    observation = data.source.pictures(data.sequences(split, index, context).observation)
     reference = judge(_history(last=observation[:, -1].float(), mean=mean_frame(observation))).double().exp()
     return Prefixes(context, index, steps[index], data.source.labels(split)[index], reference)
 
@@ -97,30 +98,31 @@ def _history(last: Tensor, mean: Tensor) -> Tensor:
     return torch.cat((last, mean), -3)
 
 
-def model_pass(context: int, samples: int, length: int, judges: Judges) -> Pass:
+def model_pass(data: SequenceDataModule, context: int, samples: int, judges: Judges) -> Pass:
     """Read a model's N completions.
 
     Args:
+        data: of strokes, up to whose length models were trained.
         context: c.
         samples: N, at least 2.
-        length: steps up to which models were trained.
         judges: the classifiers.
     """
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _to_the_end(batch)
-        return judge_completions(complete(model, batch, context, samples).frames, batch, context, length, judges)
+        frames = complete(model, data.source, batch, context, samples).frames  # (N, B, T - c, 1, H, W)
+        return judge_completions(frames, _pictures(data, batch), context, data.length, judges)
 
     return Pass(_READINGS, f"c={context},N={samples}", function, _ROWS)
 
 
-def truth_pass(context: int, length: int, judges: Judges) -> Pass:
+def truth_pass(data: SequenceDataModule, context: int, judges: Judges) -> Pass:
     """Read the true digits as if they were the completions: they bound what concerns one completion alone."""
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
-        batch = _to_the_end(batch)
+        batch = _pictures(data, _to_the_end(batch))
         frames = batch.observation[:, context:].float().expand(_TRUTHS, -1, -1, -1, -1, -1)
-        return judge_completions(frames, batch, context, length, judges)
+        return judge_completions(frames, batch, context, data.length, judges)
 
     return Pass(_READINGS, f"c={context},N={_TRUTHS}", function, _ROWS)
 
@@ -130,10 +132,10 @@ def neighbour_pass(data: SequenceDataModule, context: int, samples: int, judges:
     beginnings = Beginnings(data, context, mean_frame)
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
-        batch = _to_the_end(batch)
+        batch = _pictures(data, _to_the_end(batch))
         nearest = beginnings.nearest(batch.observation[:, :context], samples)  # (B, N)
-        others = data.sequences("train", nearest.T.flatten(), batch.observation.shape[1]).observation[:, context:]
-        frames = others.float().unflatten(0, (-1, len(nearest)))  # (N, B, T - c, 1, H, W)
+        others = data.sequences("train", nearest.T.flatten(), batch.observation.shape[1]).observation
+        frames = data.source.pictures(others)[:, context:].float().unflatten(0, (-1, len(nearest)))  # (N, B, T - c, …)
         return judge_completions(frames, batch, context, data.length, judges)
 
     return Pass(_READINGS, f"c={context},N={samples}", function, _ROWS)
@@ -145,6 +147,11 @@ def _to_the_end(batch: SequenceBatch) -> SequenceBatch:
     return SequenceBatch(*(values[:, :longest] for values in batch))  # (B, longest, ...)
 
 
+def _pictures(data: SequenceDataModule, batch: SequenceBatch) -> SequenceBatch:
+    """Put pictures in the place of observations."""
+    return batch._replace(observation=data.source.pictures(batch.observation))
+
+
 @torch.no_grad()
 def judge_completions(
     frames: Tensor, batch: SequenceBatch, context: int, length: int, judges: Judges
@@ -153,7 +160,7 @@ def judge_completions(
 
     Args:
         frames: grey values of steps c + 1 … T, `(N, B, T - c, 1, H, W)`.
-        batch: the true digits, T steps.
+        batch: the true digits as pictures, T steps.
         context: c.
         length: steps up to which models were trained; pixels are scored there too, or at the end if that comes first.
         judges: the classifiers.

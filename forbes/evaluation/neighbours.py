@@ -17,7 +17,7 @@ def last_frame(frames: Tensor) -> Tensor:
 
 
 def mean_frame(frames: Tensor) -> Tensor:
-    """Look at where the pen has been and in which order, since frames are cumulative; shapes as of `last_frame`."""
+    """Look at where the pen has been and in which order, since pictures are cumulative; shapes as of `last_frame`."""
     return frames.sum(1).float() / frames.shape[1]
 
 
@@ -37,10 +37,10 @@ class Beginnings:
         self.look = look
         self.index = torch.nonzero(data.source.steps("train") > time)[:, 0]  # (M,)
         parts = (data.sequences("train", index, time).observation for index in self.index.split(5000))
-        self.pictures = torch.cat([self._picture(frames) for frames in parts])  # (M, H W)
+        self.pictures = torch.cat([self._picture(data.source.pictures(frames)) for frames in parts])  # (M, H W)
 
     def nearest(self, frames: Tensor, count: int) -> Tensor:
-        """Find the training digits that begin most like these, `(B, T, C, H, W)`, by index, `(B, count)`."""
+        """Find the training digits that begin most like these pictures, `(B, T, C, H, W)`, by index, `(B, count)`."""
         distance = torch.cdist(self._picture(frames), self.pictures)  # (B, M)
         return self.index[distance.topk(min(count, len(self.index)), largest=False).indices]
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
+from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Split, Strokes
 from forbes.models import BeliefModel, StateSpaceModel
 
 __all__ = ["Completions", "complete", "first_of_each_class", "open_loop", "whole_sequences"]
@@ -15,7 +15,7 @@ class Completions(NamedTuple):
     """Sampled futures of some sequences after their first `context` steps."""
 
     frames: Tensor
-    """E[o_t | features] in [0, 1] of steps context + 1 … T, `(N, B, T - context, C, H, W)`."""
+    """Pictures in [0, 1] of steps context + 1 … T, `(N, B, T - context, C, H, W)`."""
     context: int
     """Steps that the model saw."""
 
@@ -25,23 +25,33 @@ class Completions(NamedTuple):
 
 
 @torch.no_grad()
-def complete(model: BeliefModel, batch: SequenceBatch, context: int, samples: int) -> Completions:
-    """Filter the first `context` steps, draw N of the belief over (h, s), roll each on to the batch's last step.
+def complete(
+    model: BeliefModel, source: SequenceSource, batch: SequenceBatch, context: int, samples: int, mean: bool = False
+) -> Completions:
+    r"""Filter the first `context` steps, draw N of the belief over (h, s), roll each on to the batch's last step.
 
-    Each sample keeps its own trajectory, so what it has decided stays decided. A model without randomness gives the
-    same N times.
+    Each sample keeps its own trajectory, so what it has decided stays decided. A model without randomness has one
+    trajectory. A picture is :math:`E[o_t \mid h_t, s_t]`; where observations are increments, it is the drawing so far:
+    what was seen, and what :math:`o_u \sim p(\cdot \mid h_u, s_u)` has added since, step by step.
 
     Args:
         model: on the batch's device.
+        source: of the batch.
         batch: B sequences of T steps, T above `context`.
         context: steps that the model sees.
         samples: N.
+        mean: of increments, take the expectation in the place of a draw: how likely each pixel is on, in grey.
     """
     sequences = len(batch.observation)
     start = model.beliefs(model.see(batch.observation[:, :context], batch.action[:, :context]), samples)  # (N B, ...)
     action = batch.action[:, context:].repeat(samples, 1, 1)  # (N B, T - context, A)
     output = model.decode(model.imagine(start, action).features)  # (N B, T - context, C, H, W)
-    return Completions(model.likelihood.mean(output).unflatten(0, (samples, sequences)), context)
+    draw = source.increments and not mean
+    frames = model.likelihood.sample(output) if draw else model.likelihood.mean(output)
+    if source.increments:
+        before = batch.observation[:, :context].repeat(samples, 1, 1, 1, 1)  # (N B, context, C, H, W)
+        frames = source.pictures(torch.cat((before.to(frames.dtype), frames), 1))[:, context:]
+    return Completions(frames.unflatten(0, (samples, sequences)), context)
 
 
 @torch.no_grad()

@@ -16,6 +16,7 @@ from forbes.data import Strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import whole_sequences
 from forbes.evaluation.record import read_record
+from forbes.evaluation.references import references
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
 from forbes.figures.returns import returns_against_env_steps
 from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
@@ -66,9 +67,12 @@ def _strokes(args: argparse.Namespace) -> None:
     index = _index(args.index, data.source.size("test")) if args.index else ambiguous_digits(data, args.context)
     batch = whole_sequences(data, "test", index)
     for time in sorted({data.length, batch.observation.shape[1]}):
-        figure = predictions(families, batch, time, args.context, args.samples)
+        figure = predictions(families, data.source, batch, time, args.context, args.samples, args.mean)
         _save(figure, args.output, f"predictions-t{time}")
-    _save(elbo_against_updates(families), args.output, "elbo")
+    count = min(data.validation_sequences, data.source.size("validation"))
+    found = references(data, runs[0].model.likelihood, "validation", count) if count else {}
+    means = {name: values.sum(1).mean().item() for name, values in found.items()}
+    _save(elbo_against_updates(families, means), args.output, "elbo")
 
 
 def _parser() -> ArgumentParser:
@@ -80,6 +84,9 @@ def _parser() -> ArgumentParser:
     parser.add_argument("-o", "--output", type=Path, default=Path("figures"), help="folder (default: figures)")
     parser.add_argument("--index", type=int, nargs="+", help="test digits of Figure 4")
     parser.add_argument("--samples", type=positive, default=6, help="completions of each digit (default: 6)")
+    parser.add_argument(
+        "--mean", action="store_true", help="of written strokes, how likely each pixel is on, in place of a drawing"
+    )
     parser.add_argument("--context", type=positive, default=15, help="frames that the models see (default: 15)")
     return parser
 

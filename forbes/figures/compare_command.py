@@ -23,6 +23,7 @@ from forbes.figures.comparison import differences, per_step, scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
 from forbes.training.configuration import allowed_modules
+from forbes.training.jobs import Job, run_jobs
 from forbes.training.provenance import command_line, commit
 from forbes.training.run_folder import RunFolder
 
@@ -38,7 +39,9 @@ Train configurations under several seeds, measure all of them on the same sequen
 
 Each run is a folder DIR/NAME-SEED; what follows -- is given to each `forbes fit`. Then `forbes evaluate` measures what
 has not been measured yet. Writes comparison.csv, .json and .md, and pictures: scores, per-step, differences (to the
-first configuration). Interrupted, the same command goes on where it stopped."""
+first configuration). Interrupted, the same command goes on where it stopped, for days if need be.
+
+  forbes compare configs/strokes/*.yaml --seeds 5 --jobs 2      # two trainings side by side, a progress line each"""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -47,9 +50,15 @@ def main(argv: Sequence[str]) -> None:
     args, flags = _parser().parse_args(argv[:cut]), list(argv[cut + 1 :])
     command = command_line("compare", *argv)
     folders = _run_folders(args.configs, args.seeds, args.output)
-    for config, of_config in zip(args.configs, folders.values(), strict=True):
-        for seed, run in of_config.items():
-            _fit(config, seed, run, flags)
+    _train(
+        [
+            (config, seed, run)
+            for config, of_config in zip(args.configs, folders.values(), strict=True)
+            for seed, run in of_config.items()
+        ],
+        flags,
+        args.jobs,
+    )
     loaded = load_runs([of_config[0] for of_config in folders.values()])
     wanted = wanted_metrics(loaded, args)
     families = [
@@ -75,6 +84,13 @@ def _parser() -> ArgumentParser:
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("runs/compare"), metavar="DIR", help="default: runs/compare"
     )
+    parser.add_argument(
+        "--jobs",
+        type=positive,
+        default=1,
+        metavar="N",
+        help="trainings at a time, sharing the threads (default: 1)",
+    )
     measures = parser.add_argument_group("how they are measured, as for forbes evaluate")
     add_score_options(measures)
     return parser
@@ -91,18 +107,20 @@ def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, 
     return {name: {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)} for name in names}
 
 
-def _fit(config: str, seed: int, run: str, flags: Sequence[str]) -> None:
-    """Train a run to its end; one that has been trained is left at once by `forbes fit --resume`."""
-    print(f"training {run}", flush=True)
-    if RunFolder(run).checkpoint.exists():
-        _require_same_configuration(run, config, seed, flags)
-        status = _forbes_fit(["--resume", run])
-    else:
-        status = _forbes_fit(["--config", config, *flags, "--seed_everything", str(seed), "--run_dir", run])
-    if status != 0:
-        raise ForbesError(
-            f"{run}: its training ended with status {status}. Mend that, then give the same command again"
-        )
+def _train(runs: Sequence[tuple[str, int, str]], flags: Sequence[str], at_once: int) -> None:
+    """Train runs, given as (configuration, seed, folder), to their ends; a finished one is left at once."""
+    jobs = []
+    for config, seed, run in runs:
+        if RunFolder(run).checkpoint.exists():
+            _require_same_configuration(run, config, seed, flags)
+            arguments = ["--resume", run]
+        else:
+            arguments = ["--config", config, *flags, "--seed_everything", str(seed), "--run_dir", run]
+        jobs.append(Job(run, _fit_command(arguments)))
+    failed = {run: status for run, status in run_jobs(jobs, at_once).items() if status != 0}
+    if failed:
+        ends = ", ".join(f"{run} with status {status}" for run, status in failed.items())
+        raise ForbesError(f"trainings that failed: {ends}. Mend that (above), then give the same command again")
 
 
 def _require_same_configuration(run: str, config: str, seed: int, flags: Sequence[str]) -> None:
@@ -130,20 +148,16 @@ def _flat(section: Any, name: str = "") -> dict[str, Any]:
 @cache
 def _configuration(config: str, *flags: str) -> str:
     """Ask `forbes fit` for the whole configuration it would train by."""
-    asked = _run_fit(["--config", config, *flags, "--print_config"], stdout=subprocess.PIPE)
+    command = _fit_command(["--config", config, *flags, "--print_config"])
+    asked = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if asked.returncode != 0:
         raise ForbesError(f"{config}: `forbes fit` cannot train by it (above). Mend it")
     return asked.stdout
 
 
-def _forbes_fit(arguments: Sequence[str]) -> int:
-    """Run `forbes fit` in a process of its own: trainings leave nothing behind in one another."""
-    return _run_fit(arguments).returncode
-
-
-def _run_fit(arguments: Sequence[str], stdout: int | None = None) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "forbes", *allowed_modules(), "fit", *arguments]
-    return subprocess.run(command, stdout=stdout, text=True, check=False)
+def _fit_command(arguments: Sequence[str]) -> list[str]:
+    """Return the command of a `forbes fit` in a process of its own: trainings leave nothing behind in one another."""
+    return [sys.executable, "-m", "forbes", *allowed_modules(), "fit", *arguments]
 
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:
@@ -157,7 +171,13 @@ def _write(comparison: Comparison, families: Sequence[Family], folder: Path, com
     """Write tables and pictures, and print the table."""
     text = markdown(comparison, families)
     tables = {name: _records(getattr(comparison, name)) for name in ("scores", "differences")}
-    record = {"command": command, "commit": commit(), **tables, "curves": comparison.curves}
+    record = {
+        "command": command,
+        "commit": commit(),
+        **tables,
+        "curves": comparison.curves,
+        "references": comparison.references,
+    }
     replace_file(folder / "comparison.csv", comparison.scores.to_csv(index=False).encode())
     replace_file(folder / "comparison.json", (json.dumps(record, indent=2) + "\n").encode())
     replace_file(folder / "comparison.md", text.encode())

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from forbes.evaluation.comparison import Comparison
 from forbes.evaluation.measured import SCORES, score_of
-from forbes.figures.style import COLUMN, GREY, PAGE, PALETTE, paper_style
+from forbes.figures.style import COLUMN, GREY, PAGE, PALETTE, draw_references, paper_style
 
 __all__ = ["differences", "per_step", "scores"]
 
@@ -24,7 +24,8 @@ def scores(comparison: Comparison) -> Figure:
     """Draw each score in a panel: a dot for each seed with its standard error, a bar at the mean over seeds.
 
     The line of a family that does not have the score stays empty. A family so far below the others that they would
-    fall on one spot is beyond the left edge, with its mean in words. Where the likelihood is known it is a dashed line.
+    fall on one spot is beyond the left edge, with its mean in words. Where the likelihood is known it is a dashed line;
+    dotted ones are models without a belief.
     """
     table = comparison.scores
     known = table[[score_of(metric) == "log_p" for metric in table["metric"]]]["mean"].mean()
@@ -41,13 +42,16 @@ def scores(comparison: Comparison) -> Figure:
                 axes.axvline(known, color=GREY, ls="--", lw=0.8)
             axes.set_title(_in_lines(metric))
             axes.margins(x=0.15)
+            draw_references(axes, comparison.references.get(metric, {}), along="x")
             axes.locator_params(axis="x", nbins=4)  # more labels than that touch
         for axes in panels[len(metrics) :]:
             axes.remove()
         panels[0].set_yticks(range(len(families)), families)
         panels[0].set_ylim(len(families) - 0.5, -0.5)
         dashed = "" if np.isnan(known) else ", dashed: the exact log p, which no bound exceeds"
-        figure.supxlabel(f"nats per sequence, more is better{dashed}", fontsize=8)
+        names = list(next(iter(comparison.references.values()), {}))
+        dotted = f", dotted: {' to '.join(dict.fromkeys((names[0], names[-1])))}" if names else ""
+        figure.supxlabel(f"nats per sequence, more is better{dashed}{dotted}", fontsize=8)
     return figure
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 from torch import Tensor
 
-from forbes.data import SequenceBatch
+from forbes.data import SequenceBatch, SequenceSource
 from forbes.evaluation.completion_scores import entropy
 from forbes.evaluation.completion_study import Row, Study
 from forbes.evaluation.estimates import Estimate
@@ -46,7 +46,14 @@ def by_ambiguity(reference: Tensor, count: int) -> Tensor:
     return order[torch.linspace(0, len(order) - 1, min(count, len(order))).round().long()]
 
 
-def drawings(study: Study, models: Sequence[BeliefModel], batch: SequenceBatch, place: Tensor, seed: int) -> Figure:
+def drawings(
+    study: Study,
+    models: Sequence[BeliefModel],
+    source: SequenceSource,
+    batch: SequenceBatch,
+    place: Tensor,
+    seed: int,
+) -> Figure:
     """Draw beginnings from the most to the least ambiguous, with completions and the classes that these show.
 
     Two models beside each other, further ones below.
@@ -54,13 +61,15 @@ def drawings(study: Study, models: Sequence[BeliefModel], batch: SequenceBatch, 
     Args:
         study: of one length of the prefix.
         models: of its runs.
+        source: of the digits.
         batch: the digits to draw, up to the end of the longest.
         place: of them among the prefixes of the study, `(R,)`.
         seed: of the completions.
     """
     context, end = study.prefixes.context, study.prefixes.steps[place]  # (R,)
     digit = torch.arange(len(place))
-    truth, seen = (batch.observation[digit, step - 1][:, None].float() for step in (end, torch.full_like(end, context)))
+    pictures = source.pictures(batch.observation)
+    truth, seen = (pictures[digit, step - 1][:, None].float() for step in (end, torch.full_like(end, context)))
     reference = study.reference.classes[place].numpy()  # (R, 10)
     ambiguity = [f"H = {value:.2f}" for value in study.reference.scores["entropy[end]"][place].tolist()]
     beginnings: list[Panel | Bars] = [
@@ -72,7 +81,8 @@ def drawings(study: Study, models: Sequence[BeliefModel], batch: SequenceBatch, 
     for row, model, colour in zip(study.runs, models, cycle(PALETTE), strict=False):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(seed, "drawings", context))
-            frames = complete(model, batch, context, _SHOWN).frames[:, digit, end - context - 1]  # (S, R, 1, H, W)
+            completions = complete(model, source, batch, context, _SHOWN)
+        frames = completions.frames[:, digit, end - context - 1]  # (S, R, 1, H, W)
         notes = [f"JS = {value:.2f}" for value in row.scores["js[end]"][place].tolist()]
         classes = Bars("their classes", row.classes[place].numpy(), colour, reference, notes)
         of_models.append([Panel(row.name, frames.transpose(0, 1), colour), classes])

@@ -51,14 +51,14 @@ def main(argv: Sequence[str]) -> None:
     runs = load_runs(args.runs)
     _check(args, runs)
     data = runs[0].data
-    hashes = [data_sha256(run.data, args.split, args.digits) for run in runs]
+    hashes = [data_sha256(run.data, args.split, args.sequences) for run in runs]
     require_comparable(runs, hashes)
     assert isinstance(data.source, Strokes)
     judges = load_judges(data.source.origin)
     named = dict(zip(run_titles(runs), runs, strict=True))
     studies = []
     for context in sorted(set(args.prefixes)):
-        beginnings = prefixes(data, args.split, args.digits, context, judges.prefix)
+        beginnings = prefixes(data, args.split, args.sequences, context, judges.prefix)
         studies.append(study(named, judges, beginnings, args.split, args.samples, args.seed))
         print_study(studies[-1], data.length)
     record = {
@@ -77,7 +77,9 @@ def _parser() -> ArgumentParser:
     parser = ArgumentParser("forbes completions", _DESCRIPTION)
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made, of strokes")
     parser.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
-    parser.add_argument("--digits", type=positive, default=300, help="the first so many of the split (default: 300)")
+    parser.add_argument(
+        "--sequences", "--digits", type=positive, default=300, help="the first so many of the split (default: 300)"
+    )
     parser.add_argument("--samples", type=positive, default=100, help="N, completions of each digit (default: 100)")
     parser.add_argument(
         "--prefixes", type=positive, nargs="+", default=[5, 10, 15], help="steps that models see (default: 5 10 15)"
@@ -92,8 +94,10 @@ def _check(args: Any, runs: Sequence[TrainedRun]) -> None:
     for run in runs:
         if not isinstance(run.data.source, Strokes):
             raise ForbesError(f"{run.path}: its data are {data_name(run.data)}, expected Strokes. Name other runs")
-        if args.digits > (size := run.data.source.size(args.split)):
-            raise ForbesError(f"--digits {args.digits}: the {args.split} split of {run.path} has {size}. Choose fewer")
+        if args.sequences > (size := run.data.source.size(args.split)):
+            raise ForbesError(
+                f"--sequences {args.sequences}: the {args.split} split of {run.path} has {size}. Choose fewer"
+            )
         if (longest := max(args.prefixes)) >= run.data.length:
             raise ForbesError(
                 f"--prefixes {longest}: the sequences of {run.path} have {run.data.length} steps, expected fewer. "
@@ -110,7 +114,7 @@ def _describe(name: str, run: TrainedRun) -> dict[str, Any]:
 
 def _write(args: Any, record: dict[str, Any], studies: Sequence[Study]) -> None:
     """Write every score with its paired differences, and the curves over n."""
-    found = [entry for one in studies for entry in entries(one, f"{args.split}[:{args.digits}]")]
+    found = [entry for one in studies for entry in entries(one, f"{args.split}[:{args.sequences}]")]
     curves = [
         {"row": row.name, "c": one.prefixes.context, "best": row.best, "average": row.average}
         for one in studies
@@ -128,7 +132,9 @@ def _draw(args: Any, runs: Sequence[TrainedRun], studies: Sequence[Study]) -> No
         end = int(one.prefixes.steps[place].max())
         batch = runs[0].data.sequences(args.split, one.prefixes.digits[place], end)
         models = [run.model for run in runs]
-        figures[f"completions-c{one.prefixes.context}"] = drawings(one, models, batch, place, args.seed)
+        figures[f"completions-c{one.prefixes.context}"] = drawings(
+            one, models, runs[0].data.source, batch, place, args.seed
+        )
     for name, figure in figures.items():
         for suffix in (".png", ".pdf"):
             save_figure(figure, args.output / f"{name}{suffix}")

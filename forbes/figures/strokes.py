@@ -1,6 +1,6 @@
 """The paper's figures on digit strokes: predictions (Figure 4) and the ELBO against updates (Figure 5)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import pandas as pd
@@ -8,11 +8,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.data import SequenceBatch, SequenceDataModule, Strokes
+from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Strokes
 from forbes.evaluation.neighbours import Beginnings, last_frame
 from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
-from forbes.figures.style import COLUMN, draw_range, paper_style, show_settled
+from forbes.figures.style import COLUMN, draw_range, draw_references, paper_style, show_settled
 from forbes.models import BeliefModel
 
 __all__ = ["Family", "ambiguous_digits", "elbo_against_updates", "predictions"]
@@ -32,32 +32,44 @@ class Family(NamedTuple):
 
 
 def predictions(
-    families: Sequence[Family], batch: SequenceBatch, time: int, context: int, samples: int, seed: int = 0
+    families: Sequence[Family],
+    source: SequenceSource,
+    batch: SequenceBatch,
+    time: int,
+    context: int,
+    samples: int,
+    mean: bool = False,
+    seed: int = 0,
 ) -> Figure:
     """Draw Figure 4: truth, some of the frames seen, and N sampled completions of each family for the same digits.
 
     Args:
         families: a group of columns each.
+        source: of the digits.
         batch: the digits, a row each, at least `time` steps.
         time: the step that is shown, counted from 1.
         context: steps that the models see.
         samples: N.
+        mean: of written strokes, show how likely each pixel is on in the place of a drawing (`complete`).
         seed: of the samples.
     """
     last = batch.observation.shape[1]
-    panels = [truth_panel(batch.observation, sorted({time, last})[::-1]), seen_panel(batch.observation, context)]
+    pictures = source.pictures(batch.observation)
+    panels = [truth_panel(pictures, sorted({time, last})[::-1]), seen_panel(pictures, context)]
     with torch.random.fork_rng(devices=[]):
         for family in families:
             torch.manual_seed(seed)
-            frames = complete(family.model, batch, context, samples).at(time)  # (N, B, C, H, W)
+            completions = complete(family.model, source, batch, context, samples, mean)
+            frames = completions.at(time)  # (N, B, C, H, W)
             panels.append(Panel(f"{family.name}, t = {time}", frames.transpose(0, 1), family.colour))
     return draw_panels(panels)
 
 
-def elbo_against_updates(families: Sequence[Family]) -> Figure:
+def elbo_against_updates(families: Sequence[Family], references: Mapping[str, float]) -> Figure:
     """Draw Figure 5: validation ELBO against updates, mean and range over runs; a diamond is the final test ELBO.
 
-    A family that is trained by another bound is drawn by that one, and then the legend names each.
+    A family that is trained by another bound is drawn by that one, and then the legend names each. Dotted are the
+    `references` of the validation split, by name.
     """
     bounds = [family.model.bound_name for family in families]
     with paper_style():
@@ -76,6 +88,7 @@ def elbo_against_updates(families: Sequence[Family]) -> Figure:
         if any(family.tests for family in families):
             axes.plot([], [], "D", color="none", markeredgecolor="black", markersize=4, label="test, at the end")
         show_settled(axes, [curve for family in families for curve in family.curves])
+        draw_references(axes, references)
         title = bounds[0].replace("elbo", "ELBO") if len(set(bounds)) == 1 else "bound"
         axes.set(xlabel="updates", ylabel=f"validation {title}\nnats per sequence")
         axes.legend(loc="lower right")
@@ -91,7 +104,7 @@ def ambiguous_digits(data: SequenceDataModule, context: int, candidates: int = 5
     source = data.source
     assert isinstance(source, Strokes)
     labels, own = source.labels("train"), source.labels("test")[:candidates]
-    test = data.sequences("test", torch.arange(len(own)), context).observation  # (N, T, C, H, W)
+    test = source.pictures(data.sequences("test", torch.arange(len(own)), context).observation)  # (N, T, C, H, W)
     nearest = Beginnings(data, context, last_frame).nearest(test, neighbours)  # (N, neighbours)
     counts = torch.nn.functional.one_hot(labels[nearest], 10).sum(1).double()  # (N, 10)
     entropy = torch.special.entr(counts / counts.sum(1, keepdim=True)).sum(1)  # (N,)

@@ -1,10 +1,10 @@
 """The look of every picture, set in one place: sizes for a paper of two columns, few colours, no pyplot state."""
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
 import pandas as pd
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from forbes.files import replace_file
 
 __all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "density_map", "draw_range"]
-__all__ += ["paper_style", "save_figure", "show_settled"]
+__all__ += ["draw_references", "paper_style", "save_figure", "show_settled"]
 
 COLUMN, PAGE = 3.3, 6.9
 """Widths in inches: one column and the whole page."""
@@ -75,6 +75,30 @@ def draw_range(axes: Axes, runs: pd.DataFrame, colour: str, label: str) -> None:
     """Draw mean and range of several runs, a column each, against the index."""
     axes.fill_between(runs.index, runs.min(axis=1), runs.max(axis=1), color=colour, alpha=0.2, lw=0)
     axes.plot(runs.index, runs.mean(axis=1), color=colour, label=label)
+
+
+def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", "y"] = "y") -> None:
+    """Draw a dotted line at each mean on an axis that shows scores; one name stands at its line.
+
+    Those far outside of what is shown, by more than its extent, are left out. Of the others the axis shows all.
+    """
+    low, high = axes.get_ylim() if along == "y" else axes.get_xlim()
+    near = {name: mean for name, mean in means.items() if 2 * low - high < mean < 2 * high - low}
+    if not near:
+        return
+    for mean in near.values():
+        (axes.axhline if along == "y" else axes.axvline)(mean, color=GREY, ls=":", lw=0.8)
+    margin = 0.03 * (high - low)
+    limits = min(low, *near.values()) - margin, max(high, *near.values()) + margin
+    best = max(near, key=lambda name: near[name])
+    if along == "y":
+        axes.set_ylim(*limits)
+        at_edge = axes.get_yaxis_transform()
+        axes.text(0.01, near[best], best, transform=at_edge, fontsize=6, color=GREY, va="bottom")
+    else:
+        axes.set_xlim(*limits)
+        at_edge = axes.get_xaxis_transform()
+        axes.text(near[best], 0.01, best, transform=at_edge, fontsize=6, color=GREY, ha="right", rotation=90)
 
 
 def show_settled(axes: Axes, curves: Sequence[pd.Series]) -> None:

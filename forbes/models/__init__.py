@@ -5,6 +5,7 @@ from forbes.models.elbo import ElboTerms, elbo_loss
 from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, OnePixel, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
 from forbes.models.particles import ParticleModel
+from forbes.models.pixels import PixelDecoder, PixelEncoder
 from forbes.models.state_space import Filtered, StateSpaceModel
 from forbes.models.vector import VectorModel
 
@@ -23,6 +24,8 @@ __all__ = [
     "OneHot",
     "OnePixel",
     "ParticleModel",
+    "PixelDecoder",
+    "PixelEncoder",
     "Prediction",
     "Rollout",
     "Seen",

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import yaml
 from jsonargparse import DefaultHelpFormatter
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import CheckpointIO
@@ -23,7 +24,7 @@ from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.training.checkpoint import AtomicCheckpointIO, SaveLast, read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside
-from forbes.training.configuration import add_links, add_seed, allow_modules
+from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults
 from forbes.training.loading import check_weights
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
@@ -112,7 +113,9 @@ class _Experiment(LightningCLI):
         if command != "fit":
             rest = list(arguments)
         elif self.resumed:
-            rest = ["--config", str(self.resumed.config), *rest]
+            older = changed_defaults(yaml.safe_load(self.resumed.config.read_text()))
+            flags = [part for key, value in older.items() for part in (f"--{key}", str(value))]
+            rest = ["--config", str(self.resumed.config), *flags, *rest]
         super().__init__(
             model_class=LightningModule,
             datamodule_class=SequenceDataModule,

@@ -2,7 +2,8 @@
 
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from jsonargparse import set_parsing_settings
 from lightning import LightningModule
@@ -11,7 +12,7 @@ from lightning.pytorch.cli import LightningArgumentParser
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 
-__all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "experiment_parser"]
+__all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "changed_defaults", "experiment_parser"]
 
 TRUSTED = ("forbes", "lightning", "torch")
 _allowed: dict[str, None] = {}  # in their order, as long as the process lives: jsonargparse keeps them too
@@ -58,6 +59,18 @@ def add_links(parser: LightningArgumentParser) -> None:
         parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
     for part in ("model", "data"):
         parser.link_arguments("seed_everything", f"{part}.init_args.seed")
+
+
+def changed_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return, by its key, what an older run did not write and had by a default that has changed since.
+
+    Strokes were whole frames before `frames` could be chosen.
+    """
+    data = config.get("data")
+    source = data.get("init_args", {}).get("source") if isinstance(data, dict) else None
+    if not isinstance(source, dict) or not str(source.get("class_path")).endswith("Strokes"):
+        return {}
+    return {} if "frames" in source.get("init_args", {}) else {"data.init_args.source.init_args.frames": "whole"}
 
 
 def experiment_parser() -> LightningArgumentParser:

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import yaml
 from lightning import LightningModule
@@ -16,7 +16,7 @@ from forbes.errors import ForbesError
 from forbes.training.acting import ActingModel
 from forbes.training.checkpoint import read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside
-from forbes.training.configuration import allow_modules, experiment_parser
+from forbes.training.configuration import allow_modules, changed_defaults, experiment_parser
 from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder
 from forbes.training.world_model import WorldModel
@@ -45,6 +45,8 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
     folder = RunFolder.trained(run)
     state = read_checkpoint(folder.checkpoint)["state_dict"]
     config = yaml.safe_load(folder.config.read_text())
+    for key, value in changed_defaults(config).items():
+        _put(config, key, value)
     allow_modules()
     parser = experiment_parser()
     try:
@@ -65,6 +67,14 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
     check_weights(built.model, state, str(folder.checkpoint))
     built.model.load_state_dict(state)
     return built.model.eval(), built.data
+
+
+def _put(config: dict[str, Any], key: str, value: Any) -> None:
+    """Set `a.b.c` in nested sections."""
+    *sections, last = key.split(".")
+    for name in sections:
+        config = config.setdefault(name, {})
+    config[last] = value
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from forbes.beliefs import BeliefFamily, FlowBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.models.base import ModelFamily
+from forbes.models.base import BeliefModel, ModelFamily
 from forbes.models.elbo import KL, ElboTerms, FreeNats, elbo_loss
 from forbes.models.likelihoods import Likelihood, Normal, VectorNormal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
@@ -115,6 +115,7 @@ class WorldModel(LightningModule):
             mlp_layers,
             prior,
         )
+        _require_path(kl, self.model)
         self.activation: Activation = activation
         activate(self.model, activation)
         if center:
@@ -134,7 +135,7 @@ class WorldModel(LightningModule):
         return self.model.elbo(batch.observation, batch.action, batch.mask, self.kl)
 
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
-        """Seed the noise of this update, so that a resumed run draws the same; look at an epoch's first observations."""
+        """Seed the noise of this update, so that a resumed run draws the same; check an epoch's first observations."""
         if batch_idx == 0:
             self.model.likelihood.check(batch.observation)
         torch.manual_seed(derive_seed(self.seed, "update", self.global_step))
@@ -242,6 +243,20 @@ def follow_rates(module: LightningModule, rates: Sequence[float]) -> None:
     scheduler.base_lrs = [*rates]
     for group, rate, share in zip(scheduler.optimizer.param_groups, rates, scheduler.lr_lambdas, strict=True):
         group["lr"] = rate * share(scheduler.last_epoch)
+
+
+def _require_path(kl: KL, model: BeliefModel) -> None:
+    """Raise a ForbesError for a path derivative where there is none."""
+    if kl != "path":
+        return
+    if type(model) is not StateSpaceModel:
+        raise ForbesError(f"WorldModel: kl is path for a {type(model).__name__}, expected analytic. Leave kl out")
+    if not model.posterior.reparameterised:
+        name = type(model.posterior).__name__
+        raise ForbesError(
+            f"WorldModel: kl is path, but the draws of a {name} are not reparameterised, expected analytic or "
+            "monte_carlo. Leave kl out"
+        )
 
 
 def _require_rank(likelihood: Likelihood, observation_shape: tuple[int, ...]) -> None:

@@ -77,6 +77,59 @@ def support(head):
     return one_hot[torch.cartesian_prod(*[torch.arange(CLASSES)] * number)].flatten(1)
 
 
+def test_the_path_log_density_is_a_function_of_the_state_alone(continuous):
+    head, context = random_head(continuous), contexts(5).requires_grad_()
+    state = head.rsample(context)[0].detach().requires_grad_()
+
+    path, plain = head.path_log_prob(state, context), head.log_prob(state, context)
+
+    torch.testing.assert_close(path, plain, rtol=0, atol=0)
+    (by_state,) = torch.autograd.grad(plain.sum(), state, retain_graph=True)
+    torch.testing.assert_close(torch.autograd.grad(path.sum(), state, retain_graph=True)[0], by_state)
+    others = [context, *head.parameters()]
+    assert not any(part is not None for part in torch.autograd.grad(path.sum(), others, allow_unused=True))
+    assert all(parameter.requires_grad for parameter in head.parameters())
+
+
+def test_the_path_gradient_of_a_kl_has_no_variance_where_both_agree(continuous):
+    head, context = random_head(continuous), contexts(200)
+    prior = random_head(continuous)  # the same parameters, of its own
+    state, _ = head.rsample(context)
+
+    kl = head.path_log_prob(state, context) - prior.log_prob(state, context)
+    gradients = torch.autograd.grad(kl.sum(), list(head.parameters()), retain_graph=True)
+    state, log_posterior = head.rsample(context)
+    plain = log_posterior - prior.log_prob(state, context)
+    noisy = torch.autograd.grad(plain.sum(), list(head.parameters()))
+
+    largest = max(gradient.abs().max() for gradient in noisy)
+    assert largest > 1  # the sum of 200 terms of mean 0 and a variance of about 1
+    assert all(gradient.abs().max() < 1e-6 * largest for gradient in gradients)
+
+
+def test_the_path_gradient_of_a_kl_is_unbiased(continuous):
+    """Against the plain gradient at the same draws: what is left out has mean 0."""
+    head, prior, number = random_head(continuous), random_head(continuous, seed=1), 4000
+    context, groups = contexts(1).expand(number, -1), 100
+    state, log_posterior = head.rsample(context)
+    left_out = log_posterior - head.path_log_prob(state, context)  # its gradient only
+
+    parameters = list(head.parameters())
+    each = [
+        torch.cat([g.flatten() for g in torch.autograd.grad(part.mean(), parameters, retain_graph=True)])
+        for part in left_out.chunk(groups)
+    ]
+    gradient = torch.stack(each)  # (groups, parameters)
+    kl = (log_posterior - prior.log_prob(state, context)).mean()
+    whole = torch.cat([g.flatten() for g in torch.autograd.grad(kl, parameters)])
+
+    error = gradient.std(0) / groups**0.5
+    moved = error > 1e-12
+    # |t| of 99 degrees of freedom exceeds 6 with probability 3e-8, of some hundred parameters with 1e-5.
+    assert (gradient.mean(0)[moved] / error[moved]).abs().max() < 6
+    assert (whole[moved] / error[moved]).abs().max() > 6  # where there is a gradient to find, it would be seen
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_density_integrates_to_one(continuous, seed):
     head = random_head(continuous, seed=seed)

@@ -21,7 +21,7 @@ def source(make_arrays, tmp_path):
     )
 
     def make(**options):
-        return Strokes(path=str(tmp_path / "strokes.npz"), **{"validation": 1, **options})
+        return Strokes(path=str(tmp_path / "strokes.npz"), **{"validation": 1, "frames": "whole", **options})
 
     return make
 
@@ -49,7 +49,7 @@ def test_frames_are_what_a_slow_reference_renders(source, length, points_per_ste
 
 
 def test_frames_of_the_bundled_digits_are_what_a_slow_reference_renders():
-    strokes = Strokes()
+    strokes = Strokes(frames="whole")
     arrays = strokes.arrays("validation")
     index = torch.arange(0, 5000, 500)
 
@@ -58,6 +58,41 @@ def test_frames_of_the_bundled_digits_are_what_a_slow_reference_renders():
     for digit, frames in zip(index.tolist(), batch.observation, strict=True):
         path = arrays.points[arrays.offsets[digit] : arrays.offsets[digit + 1]]
         np.testing.assert_array_equal(frames, render_slowly(path, 30, 1))
+
+
+@pytest.mark.parametrize("points_per_step", [1, 2, 3])
+def test_written_and_whole_frames_determine_each_other(source, points_per_step):
+    whole, written = (source(frames=frames, points_per_step=points_per_step) for frames in ("whole", "written"))
+    index = torch.tensor([0, 1, 2])
+
+    shown, added = (each.decode(each.gather("train", index, 9)) for each in (whole, written))
+
+    before = torch.cat((torch.zeros_like(shown.observation[:, :1]), shown.observation[:, :-1]), 1)
+    assert torch.equal(added.observation, shown.observation - before)
+    assert torch.equal(written.pictures(added.observation), shown.observation)
+    assert torch.equal(whole.pictures(shown.observation), shown.observation)
+    assert torch.equal(added.mask, shown.mask)
+
+
+def test_a_step_of_one_point_writes_at_most_one_pixel():
+    strokes = Strokes()
+
+    written = strokes.decode(strokes.gather("test", torch.arange(200), 30))
+    pixels = written.observation.flatten(2).sum(-1)  # (B, T)
+
+    assert pixels.max() == 1
+    assert not pixels[~written.mask].any()
+    assert not pixels[written.mask].all()  # where the pen crosses its own path it adds nothing
+
+
+def test_a_picture_of_probabilities_is_that_of_independent_pixels():
+    chance = torch.rand(2, 3, 1, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    pictures = Strokes(frames="written").pictures(chance)
+
+    for t in range(3):
+        nobody = torch.stack([1 - chance[:, u] for u in range(t + 1)]).prod(0)
+        torch.testing.assert_close(pictures[:, t], 1 - nobody)
 
 
 @pytest.mark.parametrize(("points_per_step", "steps"), [(1, [5, 6, 1]), (2, [3, 3, 1]), (4, [2, 2, 1]), (9, [1, 1, 1])])

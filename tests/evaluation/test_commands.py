@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from argparse import Namespace
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +11,10 @@ import pytest
 import torch
 
 from forbes.cli import main
-from forbes.evaluation import scoring
+from forbes.evaluation import scoring, tables
+from forbes.evaluation.commands import evaluate as measure
+from forbes.evaluation.measured import Measured, pair
+from forbes.evaluation.references import references
 from forbes.evaluation.runs import load_runs, split_batches
 from forbes.evaluation.scoring import Parts, make_pass, score_split
 from forbes.training.loading import load_run
@@ -145,10 +149,12 @@ def test_a_score_that_a_model_does_not_have_is_left_out_and_said(runs, other_fil
     assert {pair["minus"] for pair in full["test[:5]/pll[bernoulli,K=4]"]["paired"]} == {vector, particle}
     assert {pair["minus"] for pair in full["test[:5]/fivo[bernoulli,K=4]"]["paired"]} == {particle}
     lines = capsys.readouterr().out.splitlines()
-    table = {line.split("│")[2].strip(): line for line in lines if line.count("│") > 10}
-    assert table["Vector"].count("n/a") == 6
-    assert "n/a" not in table["RSSM wide"] + table["Particle"]
-    assert len([line for line in lines if line.count("n/a") == 3]) == 2  # its differences to the two others
+    assert [line.split(":")[-1].split(",")[0].strip() for line in lines[:3]] == ["Vector", "RSSM wide", "Particle"]
+    rows = [line for line in lines if line.startswith("│ test[:5]/")]
+    without = [row.split("│")[1].strip() for row in rows if row.count("n/a") == 1]  # in the first column only
+    missing = ["elbo", "reconstruction", "kl", "iwae", "fivo", "ess"]
+    assert without == [f"test[:5]/{score}" for score in missing]
+    assert len([row for row in rows if row.count("n/a") == 2]) == 3  # elbo, iwae, fivo: differences to both others
 
     module, data = load_run(vector)
     batch = data.sequences("test", torch.arange(5))
@@ -294,6 +300,64 @@ def test_the_table_names_families_and_the_metric_with_its_likelihood(runs, capsy
     assert "RSSM wide" in out  # from the experiment's name
 
 
+def test_every_score_stands_beside_its_references(runs, capsys):
+    numbers = ["--samples", "2", "--particles", "2", "--futures", "2", "--context", "2", "--sequences", "5"]
+    assert main(["evaluate", *runs, *numbers]) == 0
+
+    out, entries, run = capsys.readouterr().out, record(runs[0]), load_runs(runs)[0]
+    expected = references(run.data, run.model.likelihood, "test", 5)
+    for name, entry in entries.items():
+        score = name.partition("/")[2].partition("[")[0]
+        if score not in ("elbo", "iwae", "pll", "fivo", "open_loop"):
+            assert "references" not in entry
+            continue
+        skipped = 2 if score == "open_loop" else 0
+        assert {reference: each["mean"] for reference, each in entry["references"].items()} == {
+            reference: pytest.approx(values[:, skipped:].sum(1).mean().item()) for reference, values in expected.items()
+        }
+    assert "5-gram" in out
+    lowest = min(expected, key=lambda reference: expected[reference].sum(1).mean())
+    assert out.count(f"< {lowest}") >= 4  # hardly trained: below all of them
+
+
+@pytest.mark.parametrize("number", [1, 2, 6])
+@pytest.mark.parametrize("width", [80, 120, 200])
+def test_the_tables_fit_the_terminal_and_cut_no_name(runs, capsys, monkeypatch, number, width):
+    monkeypatch.setattr(tables, "_PIPE", width)
+    measured = evaluated(runs, number, "elbo")
+    name = "test[:1000]/open_loop_marginal[normal(0.5,scale=1),K=1000,c=15]"
+    for one in measured:
+        one.entries[name] = one.entries[NAME]
+
+    tables.print_runs(measured)
+    tables.print_references(measured)
+    tables.print_pairs(pair(measured))
+
+    lines = capsys.readouterr().out.splitlines()
+    table = [line for line in lines if line[:1] in "┏┃┡│└├"]
+    assert max(map(len, table)) <= width
+    assert "…" not in "".join(lines)
+    head, tag = name.split("[normal")
+    assert sum(head in line for line in lines) == sum(f"[normal{tag}" in line for line in lines) >= 1
+    assert [line[0] for line in lines[:number]] == [str(k + 1) for k in range(number)]
+
+
+def evaluated(runs, number, score):
+    """So many measurements of the two runs, the first as it is and the others by other names."""
+    args = Namespace(
+        sequences=5, samples=2, particles=2, futures=2, context=2, batch_size=5, seed=0, device="cpu", split="test",
+        scores=[score],
+    )  # fmt: skip
+    found = measure(runs[:1], args, "")
+    one = found[0]
+    entry = next(values for name, values in one.entries.items() if "/elbo[" in name)
+    names = [runs[0], *(f"runs/compare/a-rather-long-name-of-a-run-{k}" for k in range(1, number))]
+    return [
+        Measured(one.run._replace(path=name), {NAME: dict(entry)}, {NAME: one.totals["test[:5]/elbo[bernoulli,S=2]"]})
+        for name in names
+    ]
+
+
 def test_its_help_shows_an_example(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["evaluate", "--help"])
@@ -324,9 +388,9 @@ def test_a_broken_model_fails_and_names_run_and_sequence(runs, capsys):
 
 def test_wrong_arguments_are_named(runs, tmp_path, capsys):
     assert "--samples" in error_of(capsys, runs[0], "--samples", "0")
-    assert "at least 2" in error_of(capsys, runs[0], "--digits", "1")
+    assert "--sequences 1: a standard error needs at least 2" in error_of(capsys, runs[0], "--digits", "1")
     assert "the test split" in error_of(capsys, runs[0], "--digits", "13")
-    assert "--digits" in error_of(capsys, runs[0], "--digits", "most")
+    assert "--sequences" in error_of(capsys, runs[0], "--sequences", "most")
     short = error_of(capsys, runs[0], "--scores", "open-loop", "--context", "5")
     assert "--context 5: sequence 2 of the test split" in short
     assert "has 5 steps, expected more. Choose a smaller context" in short

@@ -24,7 +24,7 @@ def judges():
 
 @pytest.fixture(scope="module")
 def data():
-    return SequenceDataModule(Strokes(), length=LENGTH)
+    return SequenceDataModule(Strokes(frames="whole"), length=LENGTH)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_too_few_digits_that_go_on_are_an_error(data, judges):
 
 def test_a_model_that_completes_with_the_truth_scores_as_the_truth(model, data, beginnings, batch, judges):
     readings = judge_completions(repeated(batch, 3), batch, CONTEXT, LENGTH, judges)
-    truth = score_split(model, beginnings.batches(data, "test"), truth_pass(CONTEXT, LENGTH, judges)).values
+    truth = score_split(model, beginnings.batches(data, "test"), truth_pass(data, CONTEXT, judges)).values
 
     scores, expected = (summarise(each, beginnings, LENGTH) for each in (readings, truth))
 
@@ -159,7 +159,7 @@ def test_a_models_completions_are_a_function_of_the_seed(model, data, judges):
     few = prefixes(data, "test", 3, CONTEXT, judges.prefix)
 
     def read(seed):
-        return score_split(model, few.batches(data, "test"), model_pass(CONTEXT, 3, LENGTH, judges), seed).values
+        return score_split(model, few.batches(data, "test"), model_pass(data, CONTEXT, 3, judges), seed).values
 
     one, same, other = read(0), read(0), read(1)
 
@@ -183,7 +183,7 @@ def test_only_the_mean_of_its_frames_tells_in_which_order_a_beginning_was_writte
     splits = {"train": paths, "test": paths[1:]}
     save_strokes(tmp_path / "strokes.npz", {split: arrays_of(digits) for split, digits in splits.items()})
     data = SequenceDataModule(Strokes(path=str(tmp_path / "strokes.npz"), validation=0), length=6)
-    seen = data.sequences("test", torch.arange(1), 4).observation
+    seen = data.source.pictures(data.sequences("test", torch.arange(1), 4).observation)
 
     assert Beginnings(data, 4, mean_frame).nearest(seen, 1).tolist() == [[1]]
     pictures = Beginnings(data, 4, last_frame).pictures
@@ -198,3 +198,16 @@ def test_similar_digits_stand_in_for_completions(model, data, beginnings, judges
 
     assert readings["best"][:, -1].abs().max() == 0
     assert readings["grey"].abs().max() == 0
+
+
+def test_written_strokes_are_read_as_whole_frames_are(model, data, beginnings, judges):
+    written = SequenceDataModule(Strokes(frames="written"), length=LENGTH)
+
+    few, same = (prefixes(each, "test", 3, CONTEXT, judges.prefix) for each in (data, written))
+
+    assert torch.equal(few.reference, same.reference)
+    for one in (truth_pass, lambda data, *rest: neighbour_pass(data, CONTEXT, 2, judges)):
+        whole, added = (
+            score_split(model, few.batches(each, "test"), one(each, CONTEXT, judges)).values for each in (data, written)
+        )
+        assert all(torch.equal(added[name], values) for name, values in whole.items())

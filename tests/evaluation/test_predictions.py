@@ -6,12 +6,12 @@ import torch
 from forbes.beliefs import FlowBelief
 from forbes.data import SequenceDataModule, Strokes
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, StateSpaceModel
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, OnePixel, Rollout, StateSpaceModel
 
 
 @pytest.fixture
 def data(strokes_file):
-    return SequenceDataModule(Strokes(path=str(strokes_file), validation=20), batch_size=4, length=6)
+    return SequenceDataModule(Strokes(path=str(strokes_file), validation=20, frames="whole"), batch_size=4, length=6)
 
 
 @pytest.fixture
@@ -29,13 +29,13 @@ def batch(data):
     return data.sequences("test", torch.arange(5), 9)._replace(action=action)
 
 
-def seeded(model, batch, samples=3):
+def seeded(model, data, batch, samples=3):
     torch.manual_seed(0)
-    return complete(model, batch, 4, samples)
+    return complete(model, data.source, batch, 4, samples)
 
 
-def test_a_completion_has_a_frame_for_each_step_that_was_not_seen(model, batch):
-    completions = seeded(model, batch)
+def test_a_completion_has_a_frame_for_each_step_that_was_not_seen(model, data, batch):
+    completions = seeded(model, data, batch)
 
     assert completions.frames.shape == (3, 5, 5, 1, 28, 28)
     assert completions.frames.min() >= 0
@@ -44,30 +44,30 @@ def test_a_completion_has_a_frame_for_each_step_that_was_not_seen(model, batch):
     assert torch.equal(completions.at(9), completions.frames[:, :, -1])
 
 
-def test_a_completion_knows_the_prefix_and_nothing_else(model, batch):
+def test_a_completion_knows_the_prefix_and_nothing_else(model, data, batch):
     future = batch.observation.clone()
     future[:, 4:] = 1 - future[:, 4:]
     past = batch.observation.clone()
     past[:, :4] = 1 - past[:, :4]
 
-    frames = seeded(model, batch).frames
+    frames = seeded(model, data, batch).frames
 
-    assert torch.equal(seeded(model, batch._replace(observation=future)).frames, frames)
-    assert not torch.equal(seeded(model, batch._replace(observation=past)).frames, frames)
+    assert torch.equal(seeded(model, data, batch._replace(observation=future)).frames, frames)
+    assert not torch.equal(seeded(model, data, batch._replace(observation=past)).frames, frames)
 
 
-def test_samples_of_one_prefix_differ(model, batch):
-    frames = seeded(model, batch, samples=4).frames
+def test_samples_of_one_prefix_differ(model, data, batch):
+    frames = seeded(model, data, batch, samples=4).frames
     assert len(frames.flatten(1).unique(dim=0)) == 4
 
 
-def test_a_sample_keeps_its_own_trajectory(model, batch):
+def test_a_sample_keeps_its_own_trajectory(model, data, batch):
     """Rolling on the n-th belief alone gives the n-th completion: rows never mix."""
     # Without the prior's noise the rest of a trajectory is a function of its start.
     model.prior.rsample = lambda context, sample_shape=(): (context[:, :2], context[:, 0])
     model.prior.sampler = lambda *bind: model.prior.rsample
 
-    together = seeded(model, batch)
+    together = seeded(model, data, batch)
 
     with torch.no_grad():
         torch.manual_seed(0)
@@ -101,3 +101,40 @@ def test_digits_are_chosen_class_by_class_and_in_order(data, count):
     assert labels[chosen].tolist() == [*range(10), *range(10)][:count]
     first = {label: labels.tolist().index(label) for label in range(10)}
     assert chosen[:10].tolist() == [first[label] for label in range(10)][:count]
+
+
+@pytest.fixture(name="written")
+def written_fixture(strokes_file):
+    return SequenceDataModule(Strokes(path=str(strokes_file), validation=20), batch_size=4, length=6)
+
+
+def test_a_completion_of_written_strokes_is_a_drawing(model, written, batch):
+    seen = written.sequences("test", torch.arange(5), 9)._replace(action=batch.action)
+    model.likelihood = OnePixel()
+
+    frames = seeded(model, written, seen).frames  # (3, 5, 5, 1, 28, 28)
+
+    beginning = written.source.pictures(seen.observation)[:, 3]
+    assert set(frames.unique().tolist()) == {0.0, 1.0}
+    assert (frames[:, :, 0] >= beginning).all()
+    steps = torch.cat((beginning.expand(3, 1, *beginning.shape).transpose(1, 2), frames), 2).diff(dim=2)
+    assert steps.min() == 0
+    assert steps.flatten(3).sum(-1).max() == 1  # one pixel a step
+
+
+def test_the_mean_of_a_completion_is_that_of_many_drawings(model, written, batch):
+    """Along the same trajectory; drawings differ in what they draw there."""
+    seen = written.sequences("test", torch.arange(1), 9)._replace(action=batch.action[:1])
+    model.likelihood, model.prior.min_std, number = OnePixel(), 0.1, 4000
+    start = model.beliefs(model.see(seen.observation[:, :4], seen.action[:, :4]), 1)
+    rollout = model.imagine(start, seen.action[:, 4:])
+    model.beliefs = lambda seen, samples: start
+    model.imagine = lambda start, action: Rollout(*(values.repeat_interleave(len(action), 0) for values in rollout))
+
+    torch.manual_seed(0)
+    drawn = complete(model, written.source, seen, 4, number).frames.mean(0)
+    mean = complete(model, written.source, seen, 4, 1, mean=True).frames[0]
+
+    error = (mean * (1 - mean) / number).sqrt().clamp(min=1e-4)
+    # Of 5 x 784 binomial shares, the largest |z| exceeds 6 with probability 1e-5.
+    assert ((drawn - mean) / error).abs().max() < 6

@@ -22,8 +22,8 @@ ONE_EPOCH = ["--", "--trainer.max_epochs", "1"]
 MEASURES = ["--samples", "2", "--particles", "2", "--futures", "2", "--context", "2"]
 
 
-def in_this_process(arguments):
-    return main(["fit", *arguments])
+def in_this_process(jobs, at_once):
+    return {job.name: main(job.command[job.command.index("fit") :]) for job in jobs}
 
 
 def configuration_in_this_process(config, *flags):
@@ -36,7 +36,7 @@ def configuration_in_this_process(config, *flags):
 def one_process():
     """A process of its own would spend most of a test on its imports."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compare_command, "_forbes_fit", in_this_process)
+        patch.setattr(compare_command, "run_jobs", in_this_process)
         patch.setattr(compare_command, "_configuration", configuration_in_this_process)
         yield
 
@@ -125,7 +125,9 @@ def test_a_score_that_a_family_does_not_have_is_empty(configs, vector, compared,
     pll = next(name for name in table.index.levels[0] if "/pll[" in name)
     record = json.loads((folder / "comparison.json").read_text())  # which has no NaN
     text = (folder / "comparison.md").read_text()
-    rows = {line.split("|")[1].strip(" `"): line for line in text.split("Paired")[0].splitlines() if line[:1] == "|"}
+    rows = {
+        line.split("|")[1].strip(" `"): line for line in text.split("Models without")[0].splitlines() if line[:1] == "|"
+    }
     assert np.isnan(table.loc[(ELBO, "vector"), "mean"])
     assert np.isfinite(table.loc[(pll, "vector"), "mean"])
     assert table.loc[(ELBO, "vector"), "parameters"] == table.loc[(pll, "vector"), "parameters"] > 0
@@ -150,7 +152,7 @@ def test_a_family_far_below_the_others_stands_at_the_edge_in_words_and_the_known
     rows = [(f, "test/elbo[S=1]", v) for f, v in means.items()] + [(f, "test/log_p[exact]", -0.5) for f in means]
     table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
 
-    (panel,) = scores(Comparison(table, table, {})).axes
+    (panel,) = scores(Comparison(table, table, {}, {})).axes
 
     assert [text.get_text() for text in panel.texts] == ["← −40.0"]
     assert panel.get_xlim()[0] > -3
@@ -161,7 +163,7 @@ def test_a_difference_that_two_families_do_not_have_says_so():
     rows = [("a", "test/elbo[S=1]", 1.0), ("a", "test/pll[K=1]", 2.0), ("b", "test/pll[K=1]", -1.0)]
     table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
 
-    (panel,) = differences(Comparison(table, table, {}), "first").axes
+    (panel,) = differences(Comparison(table, table, {}, {}), "first").axes
 
     assert [text.get_text() for text in panel.texts] == ["+1.00", "+2.00", "n/a", "-1.00"]
 
@@ -191,15 +193,14 @@ def test_other_noise_is_measured_anew(configs, compared, tmp_path):
 def test_it_goes_on_where_it_was_stopped(configs, tmp_path, monkeypatch):
     """Killed in the second training, then between the measurement of one run and that of another."""
     command = ["compare", *configs, "--scores", "elbo", "-o", str(tmp_path), *MEASURES, *ONE_EPOCH]
-    fits, measure = [], compare_command.evaluate
+    measure = compare_command.evaluate
 
-    def killed_in_the_second(arguments):
-        fits.append(arguments)
-        return in_this_process(arguments) if len(fits) == 1 else 143
+    def killed_in_the_second(jobs, at_once):
+        return in_this_process(jobs[:1], at_once) | {jobs[1].name: 143}
 
-    monkeypatch.setattr(compare_command, "_forbes_fit", killed_in_the_second)
+    monkeypatch.setattr(compare_command, "run_jobs", killed_in_the_second)
     assert main(command) == 2
-    monkeypatch.setattr(compare_command, "_forbes_fit", in_this_process)
+    monkeypatch.setattr(compare_command, "run_jobs", in_this_process)
     monkeypatch.setattr(compare_command, "evaluate", lambda runs, *rest: measure(runs[:1], *rest) and 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(command)
@@ -252,6 +253,25 @@ def runs_of(families, name):
     return next(family for family in families if family.name == name).runs.values()
 
 
+def test_references_stand_below_the_table_and_in_the_picture(compared, families):
+    metrics = list(pd.read_csv(compared / "comparison.csv")["metric"].unique())
+
+    comparison = compare(families, metrics)
+
+    bounds = [metric for metric in metrics if score_of(metric) in ("elbo", "iwae", "pll", "fivo", "open_loop")]
+    assert [*comparison.references] == bounds
+    names = [f"{order}-gram" for order in range(1, 6)]
+    assert all([*means] == names for means in comparison.references.values())
+    text = markdown(comparison, families)
+    means = comparison.references[ELBO]
+    assert f"| `{ELBO}` | " + " | ".join(f"{mean:.2f}" for mean in means.values()) in text
+    lowest = min(names, key=means.__getitem__)
+    (row,) = [line for line in text.splitlines() if line.startswith(f"| `{ELBO}` |") and "<" in line]
+    assert row.count(f"< {lowest}") == 2  # hardly trained: below all of them
+    axes = scores(comparison._replace(references={ELBO: {"near": -1e3, "far": 1e9}})).axes[0]
+    assert [text.get_text() for text in axes.texts if "near" in text.get_text() or "far" in text.get_text()] == []
+
+
 def test_a_run_that_was_trained_otherwise_is_refused(configs, compared, capsys):
 
     assert main(["compare", *configs, "-o", str(compared), *MEASURES]) == 2
@@ -270,6 +290,8 @@ def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_
     twin = tmp_path / "rssm.yaml"
     twin.write_text(Path(configs[0]).read_text())
     assert "another configuration is called rssm" in error_of(configs[0], str(twin))
-    assert "its training ended with status 2" in error_of(configs[0], "--", "--model.no_such_key", "1")
+    failed = error_of(configs[0], "--", "--model.no_such_key", "1")
+    assert "trainings that failed: " in failed
+    assert "rssm-0 with status 2" in failed
     with pytest.raises(Exception, match=r"rssm-0: evaluation.json has no test/bleu"):
         compare(families, ["test/bleu"])

@@ -92,7 +92,7 @@ def error_of(capsys, *arguments):
     [
         (["--prefixes", "2", "6"], "--prefixes 6: the sequences of"),
         (["--samples", "1"], "--samples 1: expected at least 2"),
-        (["--digits", "13"], "--digits 13: the test split of"),
+        (["--digits", "13"], "--sequences 13: the test split of"),
         (["--digits", "1"], "of 1 digits 1 go on after 2 steps, expected at least 2"),
         (["--prefixes", "none"], "--prefixes"),
     ],

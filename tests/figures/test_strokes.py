@@ -84,7 +84,7 @@ def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo
         metric = {"test/elbo[bernoulli,S=16]": {"mean": mean, "standard_error": 1.0}}
         (tmp_path / copy / "evaluation.json").write_text(json.dumps(metric))
 
-    (axes,) = elbo_against_updates(group(load_runs(copies))).axes
+    (axes,) = elbo_against_updates(group(load_runs(copies)), {}).axes
 
     forbes, marker, rssm, _ = axes.lines
     curves = [read_metrics(run)["val/elbo[bernoulli,S=1]"].dropna() for run in runs]
@@ -101,7 +101,7 @@ def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo
 
 def test_a_family_is_drawn_where_all_its_runs_have_values():
     curves = [pd.Series([-3.0, -2.0, -1.0], [10, 20, 30]), pd.Series([-5.0, -4.0], [10, 20])]
-    (axes,) = elbo_against_updates([Family("A", BLUE, SimpleNamespace(bound_name="elbo[S=1]"), curves, [])]).axes
+    (axes,) = elbo_against_updates([Family("A", BLUE, SimpleNamespace(bound_name="elbo[S=1]"), curves, [])], {}).axes
     assert axes.get_ylabel() == "validation ELBO[S=1]\nnats per sequence"
     assert list(axes.lines[0].get_xdata()) == [10, 20]
     assert list(axes.lines[0].get_ydata()) == [-4.0, -3.0]
@@ -116,7 +116,7 @@ def test_families_of_other_bounds_are_drawn_by_their_own(runs, tiny_config, tmp_
         (tmp_path / run / "evaluation.json").write_text(json.dumps({metric: {"mean": -90.0}}))
     families = group(load_runs([runs[0], particle, vector]))
 
-    (axes,) = elbo_against_updates(families).axes
+    (axes,) = elbo_against_updates(families, {}).axes
 
     assert axes.get_ylabel() == "validation bound\nnats per sequence"
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [

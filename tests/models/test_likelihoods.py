@@ -5,7 +5,7 @@ import torch
 from torch import distributions
 
 from forbes.errors import ForbesError
-from forbes.models import Bernoulli, Normal, OneHot, VectorNormal
+from forbes.models import Bernoulli, Normal, OneHot, OnePixel, VectorNormal
 
 SHAPE = (5, 3, 2, 4, 4)  # (B, T, C, H, W)
 
@@ -26,6 +26,58 @@ def test_bernoulli_is_that_of_torch_distributions():
 
     torch.testing.assert_close(likelihood.log_prob(output(), target), expected)
     assert torch.equal(target, images(2).float())
+
+
+def each_pixel(channels=2, side=3):
+    """Every observation of at most one pixel, none first: `(C H W + 1, C, H, W)`."""
+    pixels = torch.eye(channels * side * side).view(-1, channels, side, side)
+    return torch.cat((torch.zeros_like(pixels[:1]), pixels)).byte()
+
+
+def test_one_pixel_is_a_softmax_with_none_at_zero():
+    likelihood, observation = OnePixel(), each_pixel()
+    logits = torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    log_prob = likelihood.log_prob(logits, likelihood.target(observation))
+
+    all_logits = torch.cat((torch.zeros(1, dtype=torch.float64), logits.flatten()))
+    torch.testing.assert_close(log_prob, distributions.Categorical(logits=all_logits).logits)
+    torch.testing.assert_close(log_prob.exp().sum().item(), 1.0)
+    torch.testing.assert_close(likelihood.mean(logits).flatten(), log_prob[1:].exp())
+
+
+def test_one_pixel_draws_what_it_gives_probability_to():
+    likelihood, number = OnePixel(), 20_000
+    logits = torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    torch.manual_seed(0)
+
+    drawn = likelihood.sample(logits.expand(number, -1, -1, -1))
+
+    assert drawn.flatten(1).sum(1).max() == 1
+    share, expected = drawn.mean(0), likelihood.mean(logits)
+    # Each share is binomial; of 18, the largest of |z| exceeds 4.5 with probability 1.2e-4.
+    assert ((share - expected) / (expected * (1 - expected) / number).sqrt()).abs().max() < 4.5
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "observation", "message"),
+    [
+        (OnePixel(), torch.ones(2, 1, 3, 3, dtype=torch.uint8), "a frame has 9 pixels that are on, expected at most 1"),
+        (OnePixel(), torch.full((2, 1, 1, 1), 255, dtype=torch.uint8), "values from 255 to 255, expected 0 and 1"),
+        (Bernoulli(), torch.full((2, 1, 1, 1), 7, dtype=torch.uint8), "values from 7 to 7, expected 0 and 1"),
+        (Bernoulli(), torch.full((2, 1, 1, 1), -1.0), "values from -1 to -1, expected 0 and 1"),
+        (Bernoulli(), torch.full((2, 1, 1, 1), torch.nan), "values from nan to nan, expected 0 and 1"),
+    ],
+)
+def test_observations_without_a_density_are_refused(likelihood, observation, message):
+    with pytest.raises(ForbesError, match=message):
+        likelihood.check(observation)
+
+
+def test_observations_with_a_density_pass():
+    OnePixel().check(each_pixel())
+    Bernoulli().check(images(2))
+    Normal().check(images(256))
 
 
 @pytest.mark.parametrize("std", [0.1, 1.0])

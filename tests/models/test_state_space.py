@@ -18,7 +18,7 @@ from small_models import (
 )
 
 from forbes.beliefs import GaussianBelief
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, StateSpaceModel
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, StateSpaceModel, elbo_loss
 from forbes.models.networks import activate
 
 
@@ -27,36 +27,76 @@ def family_fixture(request):
     return request.param
 
 
-def step_by_step(model, observation, action):
+def step_by_step(model, observation, action, kl="monte_carlo"):
     """The bound as the paper writes it: one network call per factor and per step, nothing shared or deferred."""
     hidden, state = model.initial(len(observation))
-    reconstruction, kl = [], []
+    reconstruction, divergence = [], []
     for t in range(observation.shape[1]):
         target = model.likelihood.target(observation[:, t])
         hidden = model.gru(model.transition(torch.cat((state, action[:, t]), -1)), hidden)
         context = model.posterior_context(torch.cat((hidden, model.encoder(target)), -1))
         state, log_posterior = model.posterior.rsample(context)
-        kl.append(log_posterior - model.prior.log_prob(state, model.prior_context(hidden)))
+        if kl == "path":
+            log_posterior = model.posterior.path_log_prob(state, context)
+        divergence.append(log_posterior - model.prior.log_prob(state, model.prior_context(hidden)))
         reconstruction.append(model.likelihood.log_prob(model.decoder(torch.cat((hidden, state), -1)), target))
-    return torch.stack(reconstruction, 1), torch.stack(kl, 1)
+    return torch.stack(reconstruction, 1), torch.stack(divergence, 1)
 
 
 @pytest.mark.usefixtures("same_noise")
-@pytest.mark.parametrize("activation", ["relu", "elu"])
-def test_the_bound_and_its_gradients_are_those_of_the_plain_loop(family, activation):
+@pytest.mark.parametrize(("activation", "kl"), [("relu", "monte_carlo"), ("elu", "monte_carlo"), ("relu", "path")])
+def test_the_bound_and_its_gradients_are_those_of_the_plain_loop(family, activation, kl):
     model, (observation, action, mask) = random_model(family), sequences()
     activate(model, activation)
+    if not model.posterior.reparameterised:
+        kl = "monte_carlo"
 
-    terms = model.elbo(observation, action, mask)
-    reconstruction, kl = step_by_step(model, observation, action)
+    terms = model.elbo(observation, action, mask, kl)
+    reconstruction, divergence = step_by_step(model, observation, action, kl)
     gradients = torch.autograd.grad(terms.elbo.sum(), list(model.parameters()))
-    expected = torch.autograd.grad((reconstruction - kl).sum(), list(model.parameters()))
+    expected = torch.autograd.grad((reconstruction - divergence).sum(), list(model.parameters()))
 
-    torch.testing.assert_close(terms.kl, kl)
+    torch.testing.assert_close(terms.kl, divergence)
     # The decoder's output is rounded to float32.
     torch.testing.assert_close(terms.reconstruction, reconstruction, rtol=1e-6, atol=1e-6)
     for (name, _), got, want in zip(model.named_parameters(), gradients, expected, strict=True):
         assert (got - want).abs().max() <= 1e-6 * want.abs().max(), name
+
+
+@pytest.mark.usefixtures("same_noise")
+def test_how_the_kl_is_differentiated_changes_no_value(family):
+    model, batch = random_model(family), sequences()
+
+    found = {kl: model.elbo(*batch, kl) for kl in ("analytic", "monte_carlo", "path")}
+
+    for kl in ("analytic", "path"):
+        torch.testing.assert_close(found[kl].elbo, found["monte_carlo"].elbo)
+        torch.testing.assert_close(found[kl].kl, found["monte_carlo"].kl)
+    closed = {kl for kl, terms in found.items() if terms.analytic_kl is not None}
+    assert closed == ({"analytic"} if family in ("gaussian", "categorical") else set())
+
+
+@pytest.mark.parametrize("kl", ["analytic", "path"])
+@pytest.mark.parametrize("family", ["gaussian", "flow", "mixture"])
+def test_the_gradient_of_the_bound_is_the_same_on_average(family, kl):
+    """Against the plain gradient, with the same noise: what is left out has mean 0."""
+    model, (observation, action, mask), number = random_model(family), sequences(), 400
+    parameters = list(model.parameters())
+
+    def gradient(kl, seed):
+        torch.manual_seed(seed)
+        return torch.cat([g.flatten() for g in torch.autograd.grad(elbo_loss(model.elbo(*batch, kl)), parameters)])
+
+    batch = (observation[:2, :3].repeat(8, 1, 1, 1, 1), action[:2, :3].repeat(8, 1, 1), mask[:2, :3].repeat(8, 1))
+    plain, other = (torch.stack([gradient(each, seed) for seed in range(number)]) for each in ("monte_carlo", kl))
+
+    difference = other - plain  # (number, parameters)
+    error = difference.std(0) / number**0.5
+    moved = error > 1e-9
+    # |t| exceeds 6 with probability 3e-9, of some thousand parameters with 1e-5.
+    assert (difference.mean(0)[moved] / error[moved]).abs().max() < 6
+    assert (other.mean(0)[moved] / error[moved]).abs().max() > 12  # a gradient off by a half would be seen
+    assert moved.sum() > 50
 
 
 @pytest.mark.usefixtures("same_noise")
@@ -151,7 +191,7 @@ def test_gradients_of_some_steps_are_those_of_the_plain_loop(family, same_noise)
 
     gradients, expected = (
         torch.autograd.grad(kl[:, 2].sum(), list(model.parameters()), allow_unused=True)
-        for kl in (model.elbo(observation, action, mask).kl, step_by_step(model, observation, action)[1])
+        for kl in (model.elbo(observation, action, mask, "monte_carlo").kl, step_by_step(model, observation, action)[1])
     )
 
     torch.testing.assert_close(gradients, expected)

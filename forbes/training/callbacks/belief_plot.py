@@ -59,6 +59,7 @@ class BeliefPlot(PictureCallback):
         assert isinstance(model, StateSpaceModel)
         index = first_of_each_class(data, "validation", self.digits)
         batch = to_device(data.sequences("validation", index), module)
+        pictures = data.source.pictures(batch.observation)
         filtered = model.filter(model.embed(batch.observation), batch.action)
         prior_context = model.prior_context(filtered.hidden)  # (B, T, C)
         times = torch.linspace(0, data.length - 1, self.columns).round().long().unique().tolist()
@@ -68,7 +69,7 @@ class BeliefPlot(PictureCallback):
                 rows = part.subplots(3, len(times), squeeze=False, gridspec_kw={"wspace": 0.3, "hspace": 0.22})
                 part.subplots_adjust(left=0.06, right=0.97, bottom=0.11, top=0.95)
                 for column, time in enumerate(times):
-                    _draw_frame(rows[0, column], batch.observation[digit, time], f"t = {time + 1}")
+                    _draw_frame(rows[0, column], pictures[digit, time], f"t = {time + 1}")
                     prior = self._sample(model.prior, prior_context[digit, time])
                     posterior = self._sample(model.posterior, filtered.context[digit, time])
                     _draw_beliefs(rows[1, column], rows[2, column], prior, posterior, named=column == 0)

@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forbes.data import SequenceDataModule
-from forbes.figures.style import BLACK, BLUE, GREY, PAGE, paper_style, show_settled
+from forbes.evaluation.references import references
+from forbes.figures.style import BLACK, BLUE, GREY, PAGE, draw_references, paper_style, show_settled
 from forbes.training.callbacks.picture import PictureCallback, to_device
 from forbes.training.run_folder import read_metrics
 from forbes.training.world_model import WorldModel
@@ -21,7 +22,8 @@ _TITLES = {"kl": "KL", "overshoot": "loss of the roll-out"}
 class ElboCurve(PictureCallback):
     """Draws `figures/elbo.png`: the bound and its parts of both splits against updates, and the KL at each step.
 
-    A model without a KL has the loss of its roll-out instead. It reads `metrics.jsonl`, so a resumed run shows its
+    A model without a KL has the loss of its roll-out instead. Dotted is what models without a belief have on the same
+    sequences (`forbes.evaluation.references`). It reads `metrics.jsonl`, so a resumed run shows its
     whole life.
 
     Args:
@@ -49,8 +51,15 @@ class ElboCurve(PictureCallback):
                 panel.set(title=_TITLES.get(name, name), xlabel="updates", ylabel=f"nats per {unit}")
             if has_kl:
                 _draw_steps(axes[3], *self._kl_per_step(module, data))
+            draw_references(axes[0], self._references(module, data))
             axes[0].legend()
         return figure
+
+    def _references(self, module: WorldModel, data: SequenceDataModule) -> dict[str, float]:
+        """Return the means of the references over the sequences of a validation."""
+        count = min(data.validation_sequences, data.source.size("validation"))
+        found = references(data, module.model.likelihood, "validation", count)
+        return {name: values.sum(1).mean().item() for name, values in found.items()}
 
     def _kl_per_step(self, module: WorldModel, data: SequenceDataModule) -> tuple[Tensor, Tensor]:
         """Average the KL over sequences, each step on its own: mean and standard error, each `(T,)`."""

@@ -60,6 +60,6 @@ class OpenLoopPanel(PictureCallback):
         model = module.model
         assert isinstance(model, StateSpaceModel)
         batch = shown_sequences(data, self.sequences, module)
-        truth = model.likelihood.picture(batch.observation)  # (B, T, C, H, W)
-        expected = open_loop(model, batch, self.context)
+        truth = data.source.pictures(model.likelihood.picture(batch.observation))  # (B, T, C, H, W)
+        expected = data.source.pictures(open_loop(model, batch, self.context))
         return imagination.open_loop(truth, expected, batch.mask, self.context, self.columns)

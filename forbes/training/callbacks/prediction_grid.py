@@ -18,7 +18,8 @@ class PredictionGrid(PictureCallback):
     """Draws `figures/predictions.png`: true digit | some of the frames seen | N sampled completions.
 
     A row a digit: the first of each class of the validation split, then the second. Completions are shown at the
-    module's own length and, where digits go on, at the end of the longest; a column is one trajectory.
+    module's own length and, where digits go on, at the end of the longest; a column is one trajectory. Of written
+    strokes each completion is a drawing, one pixel a step.
 
     Args:
         digits: rows.
@@ -45,9 +46,9 @@ class PredictionGrid(PictureCallback):
         index = first_of_each_class(data, "validation", self.digits)
         batch = to_device(whole_sequences(data, "validation", index), module)
         times = sorted({data.length, batch.observation.shape[1]})
-        completions = complete(module.model, batch, self.context, self.samples)
+        completions = complete(module.model, data.source, batch, self.context, self.samples)
         sampled = [
             Panel(f"sampled completions, t = {time}", completions.at(time).transpose(0, 1), BLUE) for time in times
         ]
-        truth = truth_panel(batch.observation, times[::-1])
-        return draw_panels([truth, seen_panel(batch.observation, self.context), *sampled])
+        pictures = data.source.pictures(batch.observation)
+        return draw_panels([truth_panel(pictures, times[::-1]), seen_panel(pictures, self.context), *sampled])

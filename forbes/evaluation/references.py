@@ -1,0 +1,49 @@
+r"""What a score must exceed to mean anything: log p of the same sequences by models that hold no belief.
+
+Of digit strokes the n-grams of pen moves (`forbes.evaluation.ngram`). Of images with a Gaussian likelihood two still
+pictures under the model's own standard deviation: the frame before, and the mean frame of the training split,
+
+.. math:: \log p(o_{1:T}) = \sum_t \log N(o_t;\, o_{t-1}, \sigma^2), \qquad \sum_t \log N(o_t;\, \bar o, \sigma^2),
+
+where :math:`o_0 = \bar o`. A model below them has learned less than that nothing moves.
+"""
+
+import torch
+from torch import Tensor
+
+from forbes.data import SequenceDataModule, Split, Strokes
+from forbes.evaluation.ngram import fit_ngrams
+from forbes.models import Likelihood, Normal
+
+__all__ = ["references"]
+
+_EXAMPLES, _ROWS = 500, 50
+"""Training sequences whose mean frame is taken, and how many are decoded at a time."""
+
+
+def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
+    """Return by name log p of each step of the first `count` sequences in nats, float64 `(N, T)`, 0 on padding."""
+    if isinstance(data.source, Strokes):
+        ngrams = fit_ngrams(data.source, data.length)
+        return {f"{order}-gram": values for order, values in ngrams.log_prob(split, count).items()}
+    if isinstance(likelihood, Normal):
+        return _still_pictures(data, likelihood, split, count)
+    return {}
+
+
+@torch.no_grad()
+def _still_pictures(data: SequenceDataModule, likelihood: Normal, split: Split, count: int) -> dict[str, Tensor]:
+    total, steps = torch.zeros(data.observation_shape, dtype=torch.float64), 0
+    for index in torch.arange(min(_EXAMPLES, data.source.size("train"))).split(_ROWS):
+        batch = data.sequences("train", index)
+        total += likelihood.target(batch.observation)[batch.mask].sum(0)
+        steps += int(batch.mask.sum())
+    mean = (total / max(steps, 1)).float()  # (C, H, W)
+    found: dict[str, list[Tensor]] = {"mean frame": [], "last frame": []}
+    for index in torch.arange(count).split(_ROWS):
+        batch = data.sequences(split, index)
+        target = likelihood.target(batch.observation)  # (B, T, C, H, W)
+        before = torch.cat((mean.expand_as(target[:, :1]), target[:, :-1]), 1)  # (B, T, C, H, W)
+        for name, picture in (("mean frame", mean.expand_as(target)), ("last frame", before)):
+            found[name].append(likelihood.log_prob(picture, target).double() * batch.mask)
+    return {name: torch.cat(parts) for name, parts in found.items()}  # (N, T)
