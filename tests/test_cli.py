@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from lightning_utilities.core.imports import RequirementCache
 
 from forbes import __version__
 from forbes.cli import COMMANDS, main
@@ -160,6 +161,20 @@ def error_of(capsys, *arguments):
         (["--data.source.point_per_step", "2"], "Strokes has no such option, did you mean points_per_step?"),
         (["--trainer.max_epoch", "3"], "trainer.max_epoch: Trainer has no such option, did you mean max_epochs?"),
         (["--modle.kl", "analytic"], "modle: the configuration has no such option, did you mean model?"),
+        (
+            ["--learning_rate", "1"],
+            "learning_rate: the configuration has no such option, did you mean model.learning_rat",
+        ),
+        (["--max_epoch", "1"], "max_epoch: the configuration has no such option, did you mean trainer.max_epochs?"),
+        (["--batch_size", "1"], "batch_size: the configuration has no such option, did you mean data.batch_size?"),
+        (["--points_per_step", "2"], "did you mean data.source.points_per_step?"),
+        (["--exploration", "0"], "did you mean model.exploration?"),
+        (["mine.yaml"], "mine.yaml: a configuration needs its flag. Say: --config mine.yaml"),
+        (
+            ["--trainer.logger", "TensorBoardLogger"],
+            "trainer.logger: save_dir missing, give it the run folder: --run_dir DIR --trainer.logger.save_dir DIR",
+        ),
+        (["--trainer.callbacks", "ModelCheckpoint", "--trainer.callbacks.save_top_k", "-3"], "save_top_k=-3"),
         (["--model.belief", "FlowBelef"], "no class FlowBelef that fits here, did you mean FlowBelief?"),
         (["--data.source", "FlowBelief"], "no class FlowBelief that fits here"),
         (
@@ -208,6 +223,15 @@ def test_a_wrong_line_of_a_configuration_is_one_sentence(change, expected, tiny_
     for configs in (["--config", str(tiny_config), "--config", "bad.yaml"], ["--config", "bad.yaml"]):
         assert error_of(capsys, "fit", *configs) == f"bad.yaml: {expected}"
     assert not Path("runs").exists()
+
+
+def test_a_logger_that_is_not_installed_is_one_sentence(tiny_config, in_tmp_path, monkeypatch, capsys):
+    absent = RequirementCache("no_such_package>=1")
+    monkeypatch.setattr("lightning.pytorch.loggers.wandb._WANDB_AVAILABLE", absent)
+
+    sentence = error_of(capsys, "fit", "--config", str(tiny_config), "--trainer.logger", "WandbLogger")
+
+    assert sentence.startswith("Requirement 'no_such_package>=1' not met. HINT: Try running `pip install")
 
 
 @pytest.mark.parametrize("text", ["model: {class_path: WorldModel", "- 1", "", "model: 3"])

@@ -5,7 +5,7 @@ import os
 import pickle
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning import LightningModule, Trainer
@@ -79,7 +79,7 @@ class SaveLast(Checkpoint):
         Lightning counts an epoch that `max_steps` or `max_time` has cut short as done, and a resumed run would miss the
         rest of it. In the checkpoint it is not.
         """
-        missing, epochs = int(not trainer.is_last_batch), trainer.fit_loop.epoch_progress
+        missing, epochs = int(not trainer.is_last_batch), cast(Any, trainer.fit_loop.epoch_progress)
         epochs.current.processed -= missing
         epochs.total.processed -= missing
         trainer.save_checkpoint(self.run.checkpoint)

@@ -27,7 +27,7 @@ from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.parsers.fit import DESCRIPTION, run_options
 from forbes.training.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
-from forbes.training.config_errors import one_sentence, raised_by_lightning, raised_inside
+from forbes.training.config_errors import one_sentence, raised_inside, said_by_lightning
 from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults, data_paths
 from forbes.training.loading import check_weights
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
@@ -90,8 +90,8 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         except (MisconfigurationException, ImportError, RuntimeError, TypeError, ValueError) as error:
             if inner := raised_inside(error):
                 raise inner from None
-            if raised_by_lightning(error):
-                raise ForbesError(" ".join(str(error).split())) from error
+            if said := said_by_lightning(error):
+                raise ForbesError(said) from error
             raise
 
 

@@ -9,16 +9,17 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
-from lightning import Callback, LightningDataModule, Trainer
+from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
 from torch import nn
 
-from forbes.data import SequenceSource
+from forbes.data import SequenceDataModule, SequenceSource
 from forbes.errors import ForbesError
 
-__all__ = ["one_sentence", "raised_by_lightning", "raised_inside"]
+__all__ = ["one_sentence", "raised_inside", "said_by_lightning"]
 
 TOP_LEVEL = ("model", "data", "trainer", "seed_everything", "config", "ckpt_path")
+SECTIONS = {"data.source": SequenceSource, "data": SequenceDataModule, "trainer": Trainer, "model": LightningModule}
 CONFIGURABLE = (nn.Module, LightningDataModule, SequenceSource, Callback, Logger)
 
 
@@ -30,6 +31,8 @@ def one_sentence(message: str, arguments: Sequence[str] = ()) -> str:
         arguments: of the command line, to tell a flag from a line of the file.
     """
     keys = re.findall(r'Parser key "([\w.]+)"', message)
+    if found := re.search(r"unrecognized arguments: (\S+\.ya?ml)\b", message):
+        return f"{found[1]}: a configuration needs its flag. Say: --config {found[1]}"
     if found := re.search(r"[Oo]ption '([\w.]+)'|unrecognized arguments: --([\w.]+)", message):
         key, sentence = _unknown_option(message, keys, found[1] or found[2])
     elif found := re.search(r"Expected a dot import path string: (\S*)|has no attribute '(\w+)'", message):
@@ -39,15 +42,21 @@ def one_sentence(message: str, arguments: Sequence[str] = ()) -> str:
         key = ".".join(keys)
         sentence = f"{found[1]} is not of forbes, lightning or torch. If you trust it, add: --allow-module {module}"
     elif found := re.search(r"arguments are required: ([\w., ]+)", message):
-        key, sentence = (
-            ".".join(keys),
-            f"{found[1]} missing, give a configuration: --config configs/strokes/forbes.yaml",
-        )
+        key, sentence = ".".join(keys), f"{found[1]} missing, {_supply('.'.join(keys), found[1])}"
     elif found := re.search(r"File does not exist: '(.*)'", message):
         return f"{found[1]}: no such file. See configs/ for those that come with forbes"
     else:
         key, sentence = ".".join(keys), _wrong_value(message)
     return f"{_place(key, arguments)}{key + ': ' if key else ''}{sentence}"
+
+
+def _supply(key: str, missing: str) -> str:
+    """Say how to give what is missing: of a class, or of the whole configuration."""
+    if not key:
+        return "give a configuration: --config configs/strokes/forbes.yaml"
+    if missing == "save_dir":
+        return f"give it the run folder: --run_dir DIR --{key}.save_dir DIR"
+    return f"give it: --{key}.{missing} VALUE"
 
 
 def _unknown_option(message: str, keys: list[str], option: str) -> tuple[str, str]:
@@ -61,8 +70,22 @@ def _unknown_option(message: str, keys: list[str], option: str) -> tuple[str, st
     elif path[0] == "trainer":
         owner, valid = "Trainer", list(inspect.signature(Trainer).parameters)
     else:
-        owner, valid, path = "the configuration", list(TOP_LEVEL), path[:1]
+        return path[0], f"the configuration has no such option{_nearest_of_all(path[0])}"
     return ".".join(path), f"{owner} has no such option{_nearest(path[-1], valid)}"
+
+
+def _nearest_of_all(option: str) -> str:
+    """Suggest the option of the whole configuration whose last word is the nearest."""
+    places = {name: f"{section}.{name}" for section, kind in SECTIONS.items() for name in _arguments(kind)}
+    places |= {name: name for name in TOP_LEVEL}
+    near = difflib.get_close_matches(option, places, n=1)
+    return f", did you mean {places[near[0]]}?" if near else _nearest(option, TOP_LEVEL)
+
+
+def _arguments(kind: type) -> set[str]:
+    """Give the arguments of a class and of all of ours that derive from it."""
+    ours = [each for each in _derived([kind]) if each is kind or each.__module__.startswith("forbes.")]
+    return {name for each in ours for name in inspect.signature(each).parameters}
 
 
 def _unknown_class(name: str) -> str:
@@ -72,14 +95,20 @@ def _unknown_class(name: str) -> str:
 
 def _class_names() -> set[str]:
     """Give the names of the classes a configuration may name."""
+    found = _derived(CONFIGURABLE)
+    return {kind.__name__ for kind in found if kind.__module__.split(".")[0] != "torch" and kind.__name__[0] != "_"}
+
+
+def _derived(kinds: Sequence[type]) -> set[type]:
+    """Give classes with all that derive from them."""
     found: set[type] = set()
-    pending = list(CONFIGURABLE)
+    pending = list(kinds)
     while pending:
         kind = pending.pop()
         if kind not in found:
             found.add(kind)
             pending += kind.__subclasses__()
-    return {kind.__name__ for kind in found if kind.__module__.split(".")[0] != "torch" and kind.__name__[0] != "_"}
+    return found
 
 
 def _nearest(word: str, valid: Sequence[str]) -> str:
@@ -122,7 +151,11 @@ def raised_inside(error: BaseException) -> ForbesError | None:
     return inner
 
 
-def raised_by_lightning(error: BaseException) -> bool:
-    """Tell whether Lightning itself has raised an error: its message is then about how it was used."""
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    return str(frame.f_globals["__name__"]).startswith("lightning.")
+def said_by_lightning(error: BaseException) -> str | None:
+    """Return the message of an error that Lightning itself has raised, as it does where it is misused; else None."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    if not frames or not frames[-1].f_globals["__name__"].startswith("lightning."):
+        return None
+    return " ".join(str(error).split())

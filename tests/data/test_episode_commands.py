@@ -158,8 +158,14 @@ def test_vectors_are_described_and_not_drawn(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["info", "absent"], "absent: there are no episodes. Collect some: forbes data collect --task TASK -o absent"),
-        (["check", "absent"], "absent: there are no episodes. Collect some: forbes data collect --task TASK -o absent"),
+        (
+            ["info", "absent"],
+            "absent: no such folder. Name one that has episodes, or collect some: forbes data collect --task TASK",
+        ),
+        (
+            ["check", "absent"],
+            "absent: no such folder. Name one that has episodes, or collect some: forbes data collect --task TASK",
+        ),
         (
             ["collect", "--task", "Unbuildable", "--episodes", "1", "-o", "x"],
             "Unbuildable: start raises ArithmeticError: the physics has exploded",

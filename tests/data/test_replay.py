@@ -258,8 +258,11 @@ def test_numbers_that_cannot_be_are_one_sentence(path, options, sentence):
 
 
 def test_an_empty_store_and_an_empty_split_are_one_sentence(tmp_path, path):
-    with pytest.raises(ForbesError, match=r"absent: there are no episodes\. Collect some: forbes data collect --task"):
+    with pytest.raises(ForbesError, match=r"absent: no such folder\. Name one that has episodes, or collect some: "):
         Replay(str(tmp_path / "absent"))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ForbesError, match=r"empty: there are no episodes\. Collect some: forbes data collect --task"):
+        Replay(str(tmp_path / "empty"))
     with pytest.raises(ForbesError, match=r"no episode is of the split test, expected one of 10\. Collect more"):
         next(iter(SequenceDataModule(Replay(str(path))).test_dataloader()))
 

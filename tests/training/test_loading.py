@@ -83,6 +83,55 @@ def test_a_configuration_of_another_version_is_one_sentence(run):
         load_run(run.path)
 
 
+def test_a_run_finds_its_data_from_any_folder(tiny_config, strokes_file, in_tmp_path, monkeypatch):
+    shutil.copy(strokes_file, "mine.npz")
+    fit = ["fit", "--config", str(tiny_config), "--data.source.path", "mine.npz", "--run_dir", "run"]
+    assert main([*fit, "--trainer.max_epochs", "1"]) == 0
+    (in_tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(in_tmp_path / "elsewhere")
+
+    _, data = load_run("../run")
+
+    assert data.source.path == str(in_tmp_path / "mine.npz")
+    assert main(["fit", "--resume", "../run", "--trainer.max_epochs", "2"]) == 0
+
+
+def test_a_moved_run_is_loaded(run, tmp_path):
+    run.path.rename(tmp_path / "moved")
+
+    load_run(tmp_path / "moved")
+
+
+def test_data_that_are_not_there_are_one_sentence(run):
+    configure(run, lambda config: config["data"]["init_args"]["source"]["init_args"].update(path="gone.npz"))
+
+    with pytest.raises(
+        ForbesError, match=r"config\.yaml: data\.source\.path is gone\.npz, which is not there\. Set it to where"
+    ):
+        load_run(run.path)
+
+
+def test_another_checkpoint_of_a_run_is_loaded_by_its_path(run):
+    checkpoint = read_checkpoint(run.checkpoint)
+    name = next(iter(checkpoint["state_dict"]))
+    checkpoint["state_dict"][name] += 1
+    best = run.checkpoint.with_name("best.ckpt")
+    AtomicCheckpointIO().save_checkpoint(checkpoint, best)
+
+    last_model, _ = load_run(run.path)
+    best_model, _ = load_run(best)
+
+    torch.testing.assert_close(best_model.state_dict()[name], last_model.state_dict()[name] + 1, rtol=0, atol=0)
+    with pytest.raises(ForbesError, match=r"worst\.ckpt: no such checkpoint\. There are best\.ckpt, last\.ckpt"):
+        load_run(best.with_name("worst.ckpt"))
+
+
+def test_a_run_does_not_go_on_from_a_checkpoint_that_it_would_overwrite(run, capsys):
+    assert main(["fit", "--resume", str(run.checkpoint)]) == 2
+
+    assert "last.ckpt: is the name of a checkpoint, expected that of a run folder" in capsys.readouterr().err
+
+
 def test_a_run_does_not_go_on_with_another_family(run, capsys):
     before = run.config.read_text()
 
