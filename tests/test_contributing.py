@@ -59,7 +59,7 @@ def test_a_belief_family_outside_this_repository_is_trained(copy_of, tiny_config
     command = re.search(r"    forbes (fit --allow-module your_module .*)", TEXT)[1]
     command = command.replace("configs/strokes/forbes.yaml", str(tiny_config))
 
-    assert main([*command.split(), "--model.belief.init_args", "{}", "--run_dir", "run"]) == 0
+    assert main([*command.split(), "--run_dir", "run"]) == 0
 
     assert "your_module.YourBelief" in RunFolder("run").config.read_text()
 
