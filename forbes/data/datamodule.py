@@ -8,7 +8,7 @@ from lightning import LightningDataModule, Trainer
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from forbes.data.source import SequenceBatch, SequenceSource, Split
+from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch, check_source
 from forbes.errors import ForbesError
 
 __all__ = ["SequenceDataModule"]
@@ -85,6 +85,7 @@ class SequenceDataModule(LightningDataModule):
         ]:
             if value < 1:
                 raise ForbesError(f"SequenceDataModule: {name} is {value}, expected at least 1")
+        check_source(source)
         self.source, self.batch_size, self.length, self.seed = source, batch_size, length, seed
         self.updates_per_epoch = updates_per_epoch
         self.validation_sequences = validation_sequences
@@ -134,11 +135,16 @@ class SequenceDataModule(LightningDataModule):
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> SequenceBatch:
         """Decode on the device."""
-        return self.source.decode(batch)
+        return self._decode(batch)
 
     def sequences(self, split: Split, index: Tensor, length: int | None = None) -> SequenceBatch:
         """Give chosen sequences of a split on the CPU, cut or padded to `length` (the module's own by default)."""
-        return self.source.decode(self.source.gather(split, index, length or self.length))
+        return self._decode(self.source.gather(split, index, length or self.length))
+
+    def _decode(self, compact: Any) -> SequenceBatch:
+        batch = self.source.decode(compact)
+        check_batch(self.source, batch)
+        return batch
 
     def _ordered(self, split: Split, limit: int | None) -> DataLoader[Any]:
         size = self.source.size(split)

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from functools import lru_cache
+from inspect import getattr_static
 from typing import Any, NamedTuple
 
 import torch
@@ -13,7 +14,7 @@ from forbes.named import Named
 from forbes.seeding import generator
 from forbes.shapes import printed_by_shape
 
-__all__ = ["SequenceBatch", "SequenceSource", "Split"]
+__all__ = ["SequenceBatch", "SequenceSource", "Split", "check_batch", "check_source"]
 
 
 @printed_by_shape
@@ -103,6 +104,41 @@ class SequenceSource(Named, ABC):
     def latest(self, count: int) -> Tensor:
         """Give training sequences to look at, those first that were learned from least; int64 `(count,)` or fewer."""
         return torch.arange(min(count, self.size("train")))
+
+
+def check_source(source: SequenceSource) -> None:
+    """Raise a ForbesError unless a source says its shapes; properties are left for later, since they may cost."""
+    kind = type(source).__name__
+    for name, expected in (("observation_shape", "(C, H, W) or (O,)"), ("action_dim", "a whole number, at least 0")):
+        if getattr_static(source, name, None) is None:
+            raise ForbesError(f"{kind}: it has no {name}, expected {expected}. Set it in its constructor")
+
+
+def check_batch(source: SequenceSource, batch: SequenceBatch) -> None:
+    """Raise a ForbesError unless a batch is what `SequenceBatch` says, of the shapes that its source says."""
+    kind, shape = type(source).__name__, tuple(source.observation_shape)
+    if not isinstance(batch, SequenceBatch):
+        raise ForbesError(f"{kind}: decode gives a {type(batch).__name__}, expected a SequenceBatch. Return one")
+    steps = tuple(batch.mask.shape)  # (B, T)
+    expected: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
+        "observation": (torch.uint8 if len(shape) == 3 else torch.float32, (*steps, *shape)),
+        "action": (torch.float32, (*steps, source.action_dim)),
+        "reward": (torch.float32, steps),
+        "mask": (torch.bool, steps[:2]),
+        "state": (torch.float32, (*steps, batch.state.shape[-1])),
+        "ended": (torch.bool, steps),
+    }
+    for name, (dtype, size) in expected.items():
+        values: Tensor = getattr(batch, name)
+        if values.dtype != dtype or tuple(values.shape) != size:
+            raise ForbesError(
+                f"{kind}: decode gives {name} {_said(values.dtype)} {tuple(values.shape)}, expected {_said(dtype)} "
+                f"{size}. Change decode, or observation_shape and action_dim"
+            )
+
+
+def _said(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
 
 
 @lru_cache(maxsize=2)

@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 from forbes.errors import ForbesError
 from forbes.shapes import printed_by_shape
 
-__all__ = ["Environment", "Step", "check_step", "finite_bounds", "repeat", "require_repeat", "scale_action"]
+__all__ = [
+    "Environment",
+    "Step",
+    "check_environment",
+    "check_step",
+    "finite_bounds",
+    "repeat",
+    "require_repeat",
+    "scale_action",
+]
 
 
 @printed_by_shape
@@ -94,8 +103,29 @@ def scale_action(action: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) ->
     return low + (action + 1.0) * (high - low) / 2
 
 
+def check_environment(environment: Environment) -> None:
+    """Raise a ForbesError unless an environment says its numbers, of the right kind, and its task."""
+    kind = type(environment).__name__
+    shape = getattr(environment, "observation_shape", None)
+    if not isinstance(shape, tuple | list) or len(shape) not in (1, 3) or not all(_counts(size) for size in shape):
+        raise ForbesError(f"{kind}: observation_shape is {shape}, expected (C, H, W) or (O,). Give the class one")
+    for name in ("action_dim", "action_repeat"):
+        if not _counts(value := getattr(environment, name, None)):
+            raise ForbesError(f"{kind}: {name} is {value}, expected a whole number above 0. Give the class one")
+    if not isinstance(environment.discrete, bool):
+        raise ForbesError(f"{kind}: discrete is {environment.discrete}, expected true or false. Give the class one")
+    if "task" not in (description := environment.describe()):
+        raise ForbesError(f"{kind}: describe() gives {description}, expected a task among it. Add its name")
+
+
+def _counts(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and bool(value > 0)
+
+
 def check_step(step: Step, shape: tuple[int, ...]) -> None:
-    """Raise a ValueError unless the observation has its shape and dtype, and all numbers are finite."""
+    """Raise a ValueError unless it is a Step whose observation has its shape and dtype, and all numbers are finite."""
+    if not isinstance(step, Step):
+        raise ValueError(f"it gives a {type(step).__name__}, expected a Step")
     observation, dtype = step.observation, "uint8" if len(shape) == 3 else "float32"
     if observation.shape != shape or observation.dtype != dtype:
         found = f"{observation.dtype} {observation.shape}"

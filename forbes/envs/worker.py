@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from forbes.envs.base import Environment, Step, check_step
+from forbes.envs.base import Environment, Step, check_environment, check_step
 from forbes.errors import ForbesError
 
 __all__ = ["BrokenEnvironmentError", "EnvironmentProcess", "belong_to_parent"]
@@ -194,6 +194,7 @@ def _serve(connection: Connection, make: Callable[[], Environment]) -> None:
     belong_to_parent()
     try:
         environment = make()
+        check_environment(environment)
         shape = tuple(environment.observation_shape)
         numbers = (environment.action_dim, environment.discrete, environment.action_repeat)
         connection.send(_Facts(shape, *numbers, environment.describe()))

@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource
+from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Simulated
 from forbes.errors import ForbesError
+from forbes.pomdps import Tiger
 
 
 class Compact(NamedTuple):
@@ -170,3 +171,51 @@ def test_refuses_a_batch_that_is_larger_than_the_split():
     with pytest.raises(ForbesError, match="batch_size is 24, but the training split has 23 sequences"):
         module(batch_size=24).train_index(0)
     assert len(module(batch_size=23).train_index(0)) == 23
+
+
+class Own(Simulated):
+    """A source of a user, right but for what a test changes."""
+
+    def __init__(self, change):
+        super().__init__(Tiger(), 4, 4, 4)
+        self.change = change
+
+    def decode(self, compact):
+        return self.change(super().decode(compact))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda batch: tuple(batch), "decode gives a tuple, expected a SequenceBatch"),
+        (
+            lambda batch: batch._replace(observation=batch.observation.double()),
+            "decode gives observation float64 (2, 3, 2), expected float32 (2, 3, 2)",
+        ),
+        (
+            lambda batch: batch._replace(observation=batch.observation[..., :1]),
+            "observation float32 (2, 3, 1), expected float32 (2, 3, 2). Change decode, or observation_shape",
+        ),
+        (lambda batch: batch._replace(action=batch.action[..., :0]), "action float32 (2, 3, 0), expected float32"),
+        (lambda batch: batch._replace(reward=batch.reward[..., None]), "reward float32 (2, 3, 1), expected"),
+        (lambda batch: batch._replace(mask=batch.mask.float()), "mask float32 (2, 3), expected bool (2, 3)"),
+        (lambda batch: batch._replace(ended=batch.ended[:, 1:]), "ended bool (2, 2), expected bool (2, 3)"),
+    ],
+)
+def test_what_a_source_gives_is_checked_with_its_first_batch(change, sentence):
+    data = SequenceDataModule(Own(change), batch_size=2, length=3)
+
+    with pytest.raises(ForbesError) as error:
+        data.sequences("train", torch.arange(2))
+    assert str(error.value).startswith("Own: ")
+    assert sentence in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["observation_shape", "action_dim"])
+def test_a_source_that_does_not_say_its_shapes_is_refused_when_it_is_given(name):
+    source = Own(lambda batch: batch)
+    SequenceDataModule(source)
+    delattr(source, name)
+
+    with pytest.raises(ForbesError, match=f"Own: it has no {name}, expected"):
+        SequenceDataModule(source)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from forbes.envs.base import Step, check_step, repeat, scale_action
+from forbes.envs.base import Environment, Step, check_environment, check_step, repeat, scale_action
+from forbes.errors import ForbesError
 
 SEEN = np.zeros(2, np.float32)
 
@@ -48,3 +49,41 @@ def test_what_is_no_step_is_said(step, sentence):
     check_step(Step(np.zeros((3, 8, 8), np.uint8)), (3, 8, 8))
     with pytest.raises(ValueError, match=sentence):
         check_step(step, SEEN.shape)
+
+
+class Sound(Environment):
+    observation_shape, action_dim = (2,), 1
+
+    def reset(self, seed):
+        return Step(np.zeros(2, np.float32))
+
+    def step(self, action):
+        return Step(np.zeros(2, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("observation_shape", None, "observation_shape is None, expected (C, H, W) or (O,). Give the class one"),
+        ("observation_shape", (8, 8), "observation_shape is (8, 8), expected"),
+        ("observation_shape", 4, "observation_shape is 4, expected"),
+        ("action_dim", 0, "action_dim is 0, expected a whole number above 0"),
+        ("action_dim", 1.5, "action_dim is 1.5, expected"),
+        ("action_repeat", None, "action_repeat is None, expected"),
+        ("discrete", 1, "discrete is 1, expected true or false"),
+        ("describe", dict, "describe() gives {}, expected a task among it"),
+    ],
+)
+def test_what_an_environment_must_say_is_checked(name, value, sentence):
+    environment = Sound()
+    check_environment(environment)
+    setattr(environment, name, value)
+
+    with pytest.raises(ForbesError) as error:
+        check_environment(environment)
+    assert str(error.value).startswith(f"Sound: {sentence}")
+
+
+def test_what_is_no_step_is_named():
+    with pytest.raises(ValueError, match="it gives a tuple, expected a Step"):
+        check_step((SEEN, 0.0), SEEN.shape)

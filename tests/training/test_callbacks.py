@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -222,7 +223,10 @@ def test_the_legend_of_beliefs_names_each_colour_that_is_drawn(tiny_run):
     figure.canvas.draw()
     box = legend.get_window_extent()
     assert not [axes for axes in figure.axes if axes.get_tightbbox().overlaps(box)]
-    assert box.x0 >= 0 <= figure.bbox.width - box.x1
+    boxes = [axes.yaxis.label.get_window_extent() for axes in figure.axes if axes.get_ylabel()]
+    assert min(each.x0 for each in (box, *boxes)) >= 0
+    assert box.x1 <= figure.bbox.width
+    assert not [one for one, other in pairwise(boxes) if one.overlaps(other)]
 
 
 def test_a_belief_of_more_dimensions_is_projected_on_the_priors_principal_plane():

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.transforms import blended_transform_factory
 from torch import Tensor
 
 from forbes.beliefs import BeliefHead
@@ -111,10 +112,10 @@ def _draw_beliefs(above: Axes, below: Axes, prior: _Cloud, posterior: _Cloud, na
     _draw_cloud(below, posterior, BLUE, posterior.samples)
     below.set_xlabel(plane, fontsize=6)
     if named:
-        above.set_ylabel(f"prior, {kind}", color=ORANGE)
-        below.set_ylabel(f"posterior, {kind}", color=BLUE)
-        for axes in (above, below):
-            axes.yaxis.set_label_coords(-0.3, 0.5)
+        for axes, name, colour in ((above, "prior", ORANGE), (below, "posterior", BLUE)):
+            axes.set_ylabel(f"{name}, {kind}", color=colour, fontsize=6)
+            at_the_edge = blended_transform_factory(axes.figure.transSubfigure, axes.transAxes)
+            axes.yaxis.set_label_coords(0.02, 0.5, transform=at_the_edge)
 
 
 def _draw_cloud(axes: Axes, cloud: _Cloud, colour: str, shown: Tensor) -> None:
