@@ -59,3 +59,16 @@ def test_images_are_held_against_still_pictures():
 
 def test_other_data_have_none():
     assert references(SequenceDataModule(Films(), length=5), Bernoulli(), "test", 2) == {}
+
+
+def test_references_of_coarse_pixels_are_always_the_same():
+    data, likelihood = SequenceDataModule(Films(), length=5), Normal(bits=5)
+    torch.manual_seed(1)
+    after = torch.rand(1)
+
+    torch.manual_seed(1)
+    first = references(data, likelihood, "test", 2)
+
+    assert torch.equal(torch.rand(1), after)  # the caller's noise is left alone
+    again = references(data, likelihood, "test", 2)
+    assert all(torch.equal(again[name], values) for name, values in first.items())
