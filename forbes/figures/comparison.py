@@ -36,13 +36,14 @@ def scores(comparison: Comparison) -> Figure:
     with paper_style():
         figure = Figure((PAGE, rows * (1.1 + 0.22 * len(families))), layout="constrained")
         panels = figure.subplots(rows, columns, sharey=True, squeeze=False).flat
+        dotted = False
         for axes, metric in zip(panels, metrics, strict=False):
             _draw_score(axes, table[table["metric"] == metric], families)
             if score_of(metric) != "open_loop" and not np.isnan(known):
                 axes.axvline(known, color=GREY, ls="--", lw=0.8)
             axes.set_title(_in_lines(metric))
             axes.margins(x=0.15)
-            draw_references(axes, comparison.references.get(metric, {}), along="x")
+            dotted |= draw_references(axes, comparison.references.get(metric, {}), along="x")
             axes.locator_params(axis="x", nbins=4)  # more labels than that touch
         for axes in panels[len(metrics) :]:
             axes.remove()
@@ -50,8 +51,8 @@ def scores(comparison: Comparison) -> Figure:
         panels[0].set_ylim(len(families) - 0.5, -0.5)
         dashed = "" if np.isnan(known) else ", dashed: the exact log p, which no bound exceeds"
         names = list(next(iter(comparison.references.values()), {}))
-        dotted = f", dotted: {' to '.join(dict.fromkeys((names[0], names[-1])))}" if names else ""
-        figure.supxlabel(f"nats per sequence, more is better{dashed}{dotted}", fontsize=8)
+        below = f", dotted: models without a belief, {names[0]} to {names[-1]}" if dotted else ""
+        figure.supxlabel(f"nats per sequence, more is better{dashed}{below}", fontsize=8)
     return figure
 
 

@@ -78,15 +78,16 @@ def draw_range(axes: Axes, runs: pd.DataFrame, colour: str, label: str) -> None:
     axes.plot(runs.index, runs.mean(axis=1), color=colour, label=label, marker=marker, markersize=3)
 
 
-def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", "y"] = "y") -> None:
-    """Draw a dotted line at each mean on an axis that shows scores; one name stands at its line.
+def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", "y"] = "y") -> bool:
+    """Draw a dotted line at each mean on an axis that shows scores, and return whether there is one.
 
-    Those far outside of what is shown, by more than its extent, are left out. Of the others the axis shows all.
+    Those far outside of what is shown, by more than its extent, are left out. Of the others the axis shows all, and the
+    name of the highest.
     """
     low, high = axes.get_ylim() if along == "y" else axes.get_xlim()
     near = {name: mean for name, mean in means.items() if 2 * low - high < mean < 2 * high - low}
     if not near:
-        return
+        return False
     for mean in near.values():
         (axes.axhline if along == "y" else axes.axvline)(mean, color=GREY, ls=":", lw=0.8)
     margin = 0.03 * (high - low)
@@ -100,6 +101,7 @@ def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", 
         axes.set_xlim(*limits)
         at_edge = axes.get_xaxis_transform()
         axes.text(near[best], 0.01, best, transform=at_edge, fontsize=6, color=GREY, ha="right", rotation=90)
+    return True
 
 
 def show_settled(axes: Axes, curves: Sequence[pd.Series]) -> None:
