@@ -160,11 +160,13 @@ def test_vectors_are_described_and_not_drawn(tmp_path, capsys):
     [
         (
             ["info", "absent"],
-            "absent: no such folder. Name one that has episodes, or collect some: forbes data collect --task TASK",
+            "absent: no such folder. Name one that has episodes, or collect some: "
+            "forbes data collect --task TASK -o absent",
         ),
         (
             ["check", "absent"],
-            "absent: no such folder. Name one that has episodes, or collect some: forbes data collect --task TASK",
+            "absent: no such folder. Name one that has episodes, or collect some: "
+            "forbes data collect --task TASK -o absent",
         ),
         (
             ["collect", "--task", "Unbuildable", "--episodes", "1", "-o", "x"],
