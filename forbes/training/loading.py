@@ -16,7 +16,13 @@ from forbes.errors import ForbesError
 from forbes.training.acting import ActingModel
 from forbes.training.checkpoint import read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside
-from forbes.training.configuration import allow_modules, changed_defaults, data_paths, experiment_parser
+from forbes.training.configuration import (
+    allow_modules,
+    changed_defaults,
+    data_paths,
+    experiment_parser,
+    require_classes,
+)
 from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder
 from forbes.training.world_model import WorldModel
@@ -56,8 +62,11 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
         parsed = parser.parse_object(
             {key: config[key] for key in ("seed_everything", "model", "data") if key in config}
         )
+        require_classes(parsed)
     except argparse.ArgumentError as error:
         raise ForbesError(f"{folder.config}: {one_sentence(str(error))}") from error
+    except ForbesError as error:
+        raise ForbesError(f"{folder.config}: {error}") from error
     for key, path in data_paths(parsed["data"]).items():
         if not Path(path).exists():
             name = "data." + key.replace("init_args.", "")
