@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -72,7 +73,7 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
             name = "data." + key.replace("init_args.", "")
             raise ForbesError(f"{folder.config}: {name} is {path}, which is not there. Set it to where the data are")
     try:
-        built = parser.instantiate(parsed)
+        built = parser.instantiate(parsed, instantiators=[(partial(_recalled, folder.path), Experience, True)])
     except ValueError as error:
         if inner := raised_inside(error):
             raise inner from None
@@ -83,6 +84,13 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
     check_weights(built.model, state, str(folder.checkpoint))
     built.model.load_state_dict(state)
     return built.model.eval(), built.data
+
+
+def _recalled(run: Path, kind: type[Experience], **arguments: Any) -> Experience:
+    """Build the source of an agent's run, with the shapes that the run has stored: no environment need start."""
+    source = kind(**arguments)
+    source.recall(run / "episodes")
+    return source
 
 
 def _put(config: dict[str, Any], key: str, value: Any) -> None:
