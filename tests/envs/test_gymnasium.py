@@ -242,7 +242,7 @@ def stranger(tmp_path, monkeypatch):
     mark = tmp_path / "executed"
     (tmp_path / "a_stranger.py").write_text(
         f"import gymnasium, pathlib\npathlib.Path({str(mark)!r}).touch()\n"
-        "gymnasium.register('Stranger-v0', entry_point='toy_gymnasium:Rooms')\n"
+        "gymnasium.register('Stranger-v0', entry_point='toy_gymnasium:Rooms', max_episode_steps=4)\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     yield mark

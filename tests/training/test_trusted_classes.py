@@ -17,7 +17,6 @@ import forbes.training.callbacks  # noqa: F401  so that it is among what a confi
 from forbes.cli import main
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
-from forbes.models.networks import EncoderFamily
 from forbes.training.configuration import TRUSTED, allow_modules, require_classes
 
 
@@ -127,16 +126,18 @@ def test_a_run_folder_that_somebody_sends_runs_nothing(tiny_run, tmp_path, mark,
     assert not mark.exists()
 
 
-def test_a_file_that_a_configuration_includes_is_no_way_round(mark, spy, tmp_path):
-    allow_modules()
-    included = tmp_path / "included.yaml"
-    included.write_text("{class_path: MLPEncoder, init_args: {width: 8}}")
-    assert build(EncoderFamily, str(included))((3,)).embedding_dim == 8
+def test_a_file_that_a_configuration_includes_is_no_way_round(tiny_config, mark, spy, in_tmp_path):
+    included = in_tmp_path / "included.yaml"
+    config = yaml.safe_load(tiny_config.read_text())
+    config["model"]["init_args"]["encoder"] = str(included)
+    Path("sent.yaml").write_text(yaml.safe_dump(config))
+    included.write_text("{class_path: MLPEncoder, init_args: {width: 8, layers: 1}}")
+    assert main(["fit", "--config", "sent.yaml", "--trainer.max_epochs", "1"]) == 0
 
-    for value in (str(included), {"__path__": attacks(mark)[3]}):
-        included.write_text(yaml.safe_dump(attacks(mark)[3]))
-        with pytest.raises((ForbesError, ArgumentError)):
-            build(EncoderFamily | dict[str, EncoderFamily], value)
+    for attack in attacks(mark):
+        included.write_text(yaml.safe_dump(attack))
+        assert main(["fit", "--config", "sent.yaml"]) == 2
+        assert main(["fit", "--config", str(tiny_config), "--model.encoder", str(included)]) == 2
 
     assert not mark.exists()
 
