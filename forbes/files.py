@@ -1,11 +1,16 @@
-"""Files that no reader sees half of, folders that no two processes write to, arrays that are stored alike anywhere."""
+"""Files that no reader sees half of, folders that no two processes write to, arrays that are stored alike anywhere.
 
+A folder may come from anywhere. What is written to it is written there, and not to where a symbolic link in it leads.
+"""
+
+import errno
 import fcntl
 import io
 import os
 import platform
+import secrets
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -15,22 +20,58 @@ from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
 
-__all__ = ["fsync_folder", "locked", "npz_bytes", "replace_file"]
+__all__ = ["fsync_folder", "locked", "no_link", "npz_bytes", "replace_file", "require_no_links"]
 
 
-def replace_file(path: Path, content: bytes | memoryview) -> None:
-    """Write beside, then rename: the path holds the old content or the new, at every instant and after a power loss."""
+def replace_file(
+    path: Path, content: bytes | memoryview, verify: Callable[[Path], None] = lambda written: None
+) -> None:
+    """Write a new file next to it, then rename: at every instant and after a power loss, the path is old or new.
+
+    Args:
+        path: of the file; a symbolic link is replaced, not followed.
+        content: of the new file.
+        verify: raises where the new file, which it is given, is not to replace the old one.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")  # nobody can guess it and put a link there
     try:
-        with temporary.open("wb") as file:
+        with temporary.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
+        verify(temporary)
         temporary.replace(path)
         fsync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def no_link(path: str, flags: int) -> int:
+    """Open a file but not through a symbolic link: `open(path, mode, opener=no_link)`.
+
+    Raises:
+        ForbesError: where the path is one.
+    """
+    try:
+        return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise _is_link(path) from error
+        raise
+
+
+def require_no_links(paths: Iterable[Path]) -> None:
+    """Raise a ForbesError where one of these is a symbolic link: what is written there would go elsewhere."""
+    for path in paths:
+        if path.is_symlink():
+            raise _is_link(path)
+
+
+def _is_link(path: Path | str) -> ForbesError:
+    return ForbesError(
+        f"{path}: is a symbolic link, expected what it names itself. Put that in its place, or delete it"
+    )
 
 
 def fsync_folder(folder: Path) -> None:
@@ -51,10 +92,11 @@ def locked(folder: Path, complaint: str) -> Iterator[None]:
         complaint: what is said where another process has it, after the folder and the process: "trains here. …".
 
     Raises:
-        ForbesError: where another process has it.
+        ForbesError: where another process has it, or a symbolic link is in it.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("a+") as file:
+    require_no_links(folder.rglob("*"))
+    with open(folder / ".lock", "a+", opener=no_link) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -262,7 +262,7 @@ def test_a_configuration_cannot_run_a_foreign_module_unless_allowed(tiny_config,
 
     sentence = error_of(capsys, *flags)
 
-    assert "stranger.MyBelief is not of forbes, lightning or torch. If you trust it, add: --allow-module" in sentence
+    assert "stranger.MyBelief is not a class of forbes or Lightning. If you trust it, add: --allow-module" in sentence
     assert not Path("executed").exists()
     assert main([*flags, "--allow-module", "stranger"]) == 0
     assert Path("executed").exists()

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
 from forbes.errors import ForbesError
+from forbes.files import no_link
 
 __all__ = ["data_folder", "download", "git_blob_id"]
 
@@ -56,7 +57,7 @@ def _receive(response: http.client.HTTPResponse, part: Path, url: str, remedy: s
     resumed = response.status == http.HTTPStatus.PARTIAL_CONTENT
     announced = response.headers["Content-Length"]
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with part.open("ab" if resumed else "wb") as file, Progress(*columns) as progress:
+    with open(part, "ab" if resumed else "wb", opener=no_link) as file, Progress(*columns) as progress:
         total = file.tell() + int(announced) if announced else None
         task = progress.add_task(url.rpartition("/")[2], total=total, completed=file.tell())
         while chunk := response.read(_CHUNK):

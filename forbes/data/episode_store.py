@@ -32,7 +32,7 @@ from forbes.data.episodes import (
     problem_with,
 )
 from forbes.errors import ForbesError
-from forbes.files import fsync_folder, locked, replace_file
+from forbes.files import fsync_folder, locked, no_link, replace_file
 
 __all__ = ["EpisodeStore", "EpisodeWriter", "first_held"]
 
@@ -141,8 +141,8 @@ class EpisodeWriter(EpisodeStore):
         self._stack = ExitStack()
         self._stack.enter_context(locked(self.path, "writes episodes here. Choose another folder"))
         if self.index.is_file():
-            content = self.index.read_bytes()
-            os.truncate(self.index, content.rfind(b"\n") + 1)
+            with open(self.index, "rb+", opener=no_link) as file:
+                file.truncate(file.read().rfind(b"\n") + 1)
         for half in self.path.glob(".*.npz.*"):
             half.unlink()
         self.refresh()
@@ -245,7 +245,7 @@ class EpisodeWriter(EpisodeStore):
     def _log(self, line: dict[str, Any]) -> None:
         """Append a line to the index, whole or not at all."""
         content = json.dumps(line).encode() + b"\n"
-        with self.index.open("ab", buffering=0) as file:
+        with open(self.index, "ab", buffering=0, opener=no_link) as file:
             size = file.tell()
             try:
                 if file.write(content) < len(content):

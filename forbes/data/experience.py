@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from forbes.data.collection import MakePolicy, collect_episodes, describe_environment, episode_seed
-from forbes.data.episode_store import EpisodeWriter, first_held
+from forbes.data.episode_store import EpisodeStore, EpisodeWriter, first_held
 from forbes.data.episodes import EpisodeRecord
 from forbes.data.player import Player
 from forbes.data.replay import Replay, Windows
@@ -44,6 +44,7 @@ class Experience(SequenceSource):
         self._make = find_environment(task, **self.options)
         self._writer: EpisodeWriter | None = None
         self._replay: Replay | None = None
+        self._shapes: dict[str, Any] | None = None
 
     @cached_property
     def environment(self) -> EnvironmentProcess:
@@ -58,17 +59,28 @@ class Experience(SequenceSource):
     @property
     def observation_shape(self) -> tuple[int, ...]:  # type: ignore[override]
         """See `SequenceSource`."""
-        return self.environment.observation_shape
+        return tuple(self._known_shapes()["observation_shape"])
 
     @property
     def action_dim(self) -> int:  # type: ignore[override]
         """See `SequenceSource`."""
-        return self.environment.action_dim
+        return int(self._known_shapes()["action_dim"])
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
         """See `SequenceSource`."""
-        return self.environment.discrete
+        return bool(self._known_shapes()["discrete"])
+
+    def recall(self, folder: Path) -> None:
+        """Take the shapes from the episodes of a store, where it has some: then no environment starts to tell them."""
+        newest = max(EpisodeStore(folder).records.values(), default=None)
+        self._shapes = newest and newest.environment
+
+    def _known_shapes(self) -> dict[str, Any]:
+        """Return the shapes, from the environment unless they are known, as a store records them."""
+        if self._shapes is None:
+            self._shapes = describe_environment(self.environment)
+        return self._shapes
 
     def open(self, folder: Path) -> None:
         """Keep the episodes in a folder, which no other process may write to until `close`."""

@@ -2,8 +2,10 @@
 
 import difflib
 import inspect
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from forbes.envs.base import Environment
@@ -23,7 +25,7 @@ _HORIZONS = {"mountain_hike": 75, "multi_start_hike": 75, "t_maze": 30, "tiger":
 TASKS = f"""\
 {", ".join(_HORIZONS)}: processes with an exact belief
 {_GYMNASIUM}ID: any environment of Gymnasium; of a package that registers its own, with the package's name:
-  {_GYMNASIUM}minigrid:MiniGrid-Empty-5x5-v0
+  {_GYMNASIUM}minigrid:MiniGrid-Empty-5x5-v0; of a module of your own with --allow-module MODULE, too
 CLASS: an Environment of your own, of a module named by --allow-module
 anything else is a task of the DeepMind Control Suite, domain_task: cartpole_swingup, ball_in_cup_catch, walker_walk"""
 
@@ -36,7 +38,8 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
         options: of the environment's constructor.
 
     Raises:
-        ForbesError: where no environment can be meant, or it has no such option.
+        ForbesError: where no environment can be meant, it has no such option, or it is of a module of Gymnasium's
+            that nobody has allowed.
     """
     own = {kind.__name__: kind for kind in _descendants(Environment) if not kind.__module__.startswith("forbes.")}
     make: Callable[..., Environment]
@@ -45,6 +48,7 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
     elif task in _HORIZONS:
         make = partial(_open_process, task)
     elif task.startswith(_GYMNASIUM):
+        _require_known_module(task)
         make = partial(Gymnasium, task.removeprefix(_GYMNASIUM))
     elif near := difflib.get_close_matches(task, [*own, *_HORIZONS], n=1, cutoff=0.8):
         raise ForbesError(f"{task}: no such task. Did you mean {near[0]}?")
@@ -54,6 +58,21 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
     if unknown:
         raise ForbesError(f"{task}: its environment has no option {min(unknown)}. Leave it out")
     return partial(make, **options)
+
+
+def _require_known_module(task: str) -> None:
+    """Refuse `gymnasium:MODULE:ID` where Gymnasium would import a module that only the task names.
+
+    A configuration may come from anywhere, and to import a module is to run it. Known are what is imported already, as
+    a module of --allow-module is, and the packages that register environments by an entry point.
+    """
+    module = task.removeprefix(_GYMNASIUM).rpartition(":")[0]
+    registering = {entry.module.partition(".")[0] for entry in entry_points(group="gymnasium.envs")}
+    if module and module not in {*sys.modules, *registering}:
+        raise ForbesError(
+            f"{task}: {module} is not a package that registers environments. If you trust it, add: "
+            f"--allow-module {module}"
+        )
 
 
 def _open_process(task: str, shows: "Shown" = "observation") -> Environment:

@@ -13,7 +13,7 @@ from lightning.fabric.plugins import CheckpointIO
 from lightning.pytorch.callbacks import Callback, Checkpoint
 
 from forbes.errors import ForbesError
-from forbes.files import fsync_folder
+from forbes.files import replace_file
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["AtomicCheckpointIO", "ResumeWholeEpochs", "SaveLast", "read_checkpoint"]
@@ -29,22 +29,13 @@ class AtomicCheckpointIO(CheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
     ) -> None:
-        """Write a temporary file in the same folder, verify it, and rename it to `path`."""
+        """Write another file in the same folder, verify it, and rename it to `path`."""
         path = Path(path)
-        temporary = path.with_name(f".{path.name}.part")
         content = io.BytesIO()  # written to a full disk directly, torch.save fails without saying why
         torch.save(checkpoint, content)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with temporary.open("wb") as file:
-                file.write(content.getbuffer())
-                file.flush()
-                os.fsync(file.fileno())
-            _verify(temporary)
-            temporary.replace(path)
-            fsync_folder(path.parent)
+            replace_file(path, content.getbuffer(), _verify)
         except OSError as error:
-            temporary.unlink(missing_ok=True)
             raise ForbesError(
                 f"{path}: the checkpoint cannot be written ({error.strerror}), the one before it is untouched. "
                 "Make room or choose another --run_dir"

@@ -28,7 +28,14 @@ from forbes.errors import ForbesError
 from forbes.parsers.fit import DESCRIPTION, run_options
 from forbes.training.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside, said_by_lightning
-from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults, data_paths
+from forbes.training.configuration import (
+    add_links,
+    add_seed,
+    allow_modules,
+    changed_defaults,
+    data_paths,
+    require_classes,
+)
 from forbes.training.loading import check_weights
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
@@ -159,6 +166,8 @@ class _Experiment(LightningCLI):
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse; Lightning's own would warn that the process has arguments, too. A run knows its data from anywhere."""
         self.config = parser.parse_args(args)
+        for section in ("model", "data", "trainer"):
+            require_classes(self.config[section], section)
         data = self.config["data"]
         for key, path in data_paths(data).items():
             data[key] = str(Path(path).absolute())

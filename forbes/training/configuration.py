@@ -1,29 +1,49 @@
 """What a configuration may name and what is linked to what; how a run's configuration becomes a model and its data."""
 
 import importlib
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jsonargparse import Namespace, set_parsing_settings
-from lightning import LightningModule
+from lightning import Callback, LightningDataModule, LightningModule
+from lightning.fabric.plugins import CheckpointIO, ClusterEnvironment, Precision
+from lightning.pytorch.accelerators import Accelerator
 from lightning.pytorch.cli import LightningArgumentParser
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins import LayerSync
+from lightning.pytorch.profilers import Profiler
+from lightning.pytorch.strategies import Strategy
+from torch import nn
 
-from forbes.data import SequenceDataModule
+from forbes.data import SequenceDataModule, SequenceSource
 from forbes.errors import ForbesError
+from forbes.models import Likelihood
+from forbes.pomdps import Process
 
 __all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "changed_defaults", "data_paths"]
-__all__ += ["experiment_parser"]
+__all__ += ["experiment_parser", "require_classes"]
 
-TRUSTED = ("forbes", "lightning", "torch")
+TRUSTED = ("forbes.beliefs", "forbes.data", "forbes.models", "forbes.pomdps", "forbes.training")
+TRUSTED += ("lightning.fabric.plugins",)
+TRUSTED += tuple(f"lightning.pytorch.{part}" for part in ("accelerators", "callbacks", "loggers", "plugins"))
+TRUSTED += ("lightning.pytorch.profilers", "lightning.pytorch.strategies")
+"""Packages whose classes a configuration may name."""
+_REFUSED = ("*", "forbes.training.metrics_log")  # all else, and a logger that appends to whatever file it is given
+FAMILIES = (nn.Module, Likelihood, LightningDataModule, SequenceSource, Process, Callback, Logger, Profiler)
+FAMILIES += (Accelerator, CheckpointIO, ClusterEnvironment, LayerSync, Precision, Strategy)
+"""What these classes derive from."""
+_BY_A_CLASS = "Name a class of forbes or Lightning, or one of your own with --allow-module MODULE"
 _allowed: dict[str, None] = {}  # in their order, as long as the process lives: jsonargparse keeps them too
 
 
 def allow_modules(names: Sequence[str] = ()) -> None:
-    """Let configurations name classes of this package, Lightning, torch and the given modules, nothing else.
+    """Let configurations name classes of `TRUSTED` and of the given modules, nothing else.
 
     A configuration may come from anywhere, and to name a class is to import, hence to run, its module. A given module
-    is imported, from the working directory or as installed, so that its classes are known by their short names.
+    is imported, from the working directory or as installed, so that its classes are known by their short names. Where
+    any value is accepted, a class that is named stays a name. See `require_classes` for what else is refused.
 
     Raises:
         ForbesError: when a given module does not exist.
@@ -36,12 +56,58 @@ def allow_modules(names: Sequence[str] = ()) -> None:
         except ModuleNotFoundError as error:
             raise ForbesError(f"--allow-module {name}: {error}. Name an installed one or one of this folder") from error
     _allowed.update(dict.fromkeys(names))
-    set_parsing_settings(import_path_denylist=["*"], import_path_allowlist=[*TRUSTED, *names])
+    set_parsing_settings(
+        import_path_denylist=[*_REFUSED],
+        import_path_allowlist=[*TRUSTED, *names],
+        instantiate_subclass_spec_in_any=False,
+    )
 
 
 def allowed_modules() -> list[str]:
     """Give the flags that let another process name the classes of the same modules."""
     return [part for name in _allowed for part in ("--allow-module", name)]
+
+
+def require_classes(config: Any, key: str = "") -> None:
+    """Refuse a parsed configuration that would call anything but a class of `FAMILIES` or of an allowed module.
+
+    jsonargparse compares classes with the type of the parameter, but calls any function, with the arguments of the
+    configuration, where a parameter is a Callable. A function of an allowed module may be given by its name alone.
+
+    Args:
+        config: what jsonargparse has parsed and not yet instantiated, or a part of it.
+        key: of the part.
+
+    Raises:
+        ForbesError: for the first name that is refused.
+    """
+    if isinstance(config, Namespace):
+        config = vars(config)
+    if isinstance(config, Mapping):
+        if "class_path" in config:
+            _require_class(str(config["class_path"]), key)
+        for name, value in config.items():
+            require_classes(value, key if name == "init_args" else f"{key}.{name}".removeprefix("."))
+    elif isinstance(config, list | tuple | set | frozenset):
+        for value in config:
+            require_classes(value, key)
+    elif not callable(config) or isinstance(config, os.PathLike):  # a path: of a file that a part was read from
+        return
+    elif not _is_allowed(getattr(config, "__module__", None)):
+        raise ForbesError(f"{key}: is a {type(config).__name__}, expected a class. {_BY_A_CLASS}")
+
+
+def _require_class(path: str, key: str) -> None:
+    """Refuse a path that is not that of a class; whatever was parsed is imported already."""
+    module, _, name = path.rpartition(".")
+    kind = getattr(sys.modules.get(module), name, None)
+    if not isinstance(kind, type) or not (issubclass(kind, FAMILIES) or _is_allowed(kind.__module__)):
+        raise ForbesError(f"{key}: {path} is not a class that fits here. {_BY_A_CLASS}")
+
+
+def _is_allowed(module: str | None) -> bool:
+    """Tell whether a module, or the package it is in, was given to `allow_modules`."""
+    return any(f"{module}.".startswith(f"{name}.") for name in _allowed)
 
 
 def add_seed(parser: LightningArgumentParser) -> None:

@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,7 +17,13 @@ from forbes.errors import ForbesError
 from forbes.training.acting import ActingModel
 from forbes.training.checkpoint import read_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside
-from forbes.training.configuration import allow_modules, changed_defaults, data_paths, experiment_parser
+from forbes.training.configuration import (
+    allow_modules,
+    changed_defaults,
+    data_paths,
+    experiment_parser,
+    require_classes,
+)
 from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder
 from forbes.training.world_model import WorldModel
@@ -56,14 +63,17 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
         parsed = parser.parse_object(
             {key: config[key] for key in ("seed_everything", "model", "data") if key in config}
         )
+        require_classes(parsed)
     except argparse.ArgumentError as error:
         raise ForbesError(f"{folder.config}: {one_sentence(str(error))}") from error
+    except ForbesError as error:
+        raise ForbesError(f"{folder.config}: {error}") from error
     for key, path in data_paths(parsed["data"]).items():
         if not Path(path).exists():
             name = "data." + key.replace("init_args.", "")
             raise ForbesError(f"{folder.config}: {name} is {path}, which is not there. Set it to where the data are")
     try:
-        built = parser.instantiate(parsed)
+        built = parser.instantiate(parsed, instantiators=[(partial(_recalled, folder.path), Experience, True)])
     except ValueError as error:
         if inner := raised_inside(error):
             raise inner from None
@@ -74,6 +84,13 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
     check_weights(built.model, state, str(folder.checkpoint))
     built.model.load_state_dict(state)
     return built.model.eval(), built.data
+
+
+def _recalled(run: Path, kind: type[Experience], **arguments: Any) -> Experience:
+    """Build the source of an agent's run, with the shapes that the run has stored: no environment need start."""
+    source = kind(**arguments)
+    source.recall(run / "episodes")
+    return source
 
 
 def _put(config: dict[str, Any], key: str, value: Any) -> None:

@@ -9,6 +9,8 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
+from forbes.files import no_link
+
 __all__ = ["JsonLinesLogger", "MarkStart"]
 
 
@@ -57,7 +59,7 @@ class JsonLinesLogger(Logger):
         self._append({"update": update, "start": True})
 
     def _append(self, record: dict[str, Any]) -> None:
-        with self.path.open("ab") as file:  # closed, hence flushed, at each line
+        with open(self.path, "ab", opener=no_link) as file:  # closed, hence flushed, at each line
             if not self._whole:
                 content = self.path.read_bytes()
                 file.truncate(content.rfind(b"\n") + 1)  # a kill may have cut the last line short

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from forbes.errors import ForbesError
-from forbes.files import locked
+from forbes.files import locked, require_no_links
 
 __all__ = ["RunFolder", "experiment_name", "read_metrics"]
 
@@ -70,7 +70,8 @@ class RunFolder:
         """Open the folder of a run that has a checkpoint.
 
         Raises:
-            ForbesError: when there is no such run, or it was stopped before its first checkpoint.
+            ForbesError: when there is no such run, it was stopped before its first checkpoint, or a folder in it is a
+                symbolic link, through which results would be written elsewhere.
         """
         run = cls(path)
         if not run.path.is_dir():
@@ -82,6 +83,7 @@ class RunFolder:
             raise ForbesError(f"{run.checkpoint}: no such checkpoint. There are {', '.join(there) or 'none'}")
         if not run.checkpoint.is_file():
             raise ForbesError(f"{run}: has no checkpoint yet. Train it: forbes fit --config {run.config}")
+        require_no_links(path for path in run.path.iterdir() if path.is_dir())
         return run
 
     def checkpoint_sha256(self) -> str:
@@ -92,6 +94,8 @@ class RunFolder:
     def locked(self) -> Iterator[None]:
         """Keep every other process from training in this folder; the system frees it when the process dies."""
         with locked(self.path, "trains here. Choose another --run_dir"):
+            for half in self.checkpoint.parent.glob(".*.ckpt.*"):  # of a process that was killed while it saved
+                half.unlink()
             yield
 
 

@@ -1,5 +1,8 @@
 """Environments of Gymnasium: an action and a step are what Gymnasium itself makes of them."""
 
+import sys
+from importlib.metadata import EntryPoint
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,7 @@ import toy_gymnasium  # noqa: E402
 from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiDiscrete, OneOf, Sequence, Text, Tuple  # noqa: E402
 
 from forbes.cli import main  # noqa: E402
+from forbes.data import Experience  # noqa: E402
 from forbes.data.episode_store import EpisodeStore  # noqa: E402
 from forbes.envs import Gymnasium, find_environment  # noqa: E402
 from forbes.envs.base import check_step  # noqa: E402
@@ -230,6 +234,51 @@ def test_a_package_that_registers_as_minigrid_does_is_collected(tmp_path):
     assert episode.observation.shape == (5, 4 + 7 * 7 * 3)
     np.testing.assert_array_equal(episode.observation[:, :4], np.eye(4)[[2] * 5])
     np.testing.assert_array_equal(episode.observation[:, 4:], np.float32(51 / 255))
+
+
+@pytest.fixture
+def stranger(tmp_path, monkeypatch):
+    """A module that says when it is imported, and registers an environment."""
+    mark = tmp_path / "executed"
+    (tmp_path / "a_stranger.py").write_text(
+        f"import gymnasium, pathlib\npathlib.Path({str(mark)!r}).touch()\n"
+        "gymnasium.register('Stranger-v0', entry_point='toy_gymnasium:Rooms', max_episode_steps=4)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield mark
+    sys.modules.pop("a_stranger", None)
+
+
+@pytest.mark.parametrize("task", ["a_stranger:Stranger-v0", "a_stranger:more:Stranger-v0", "os.path2:Stranger-v0"])
+def test_a_module_that_only_a_task_names_is_not_imported(stranger, tmp_path, capsys, task):
+    collect = ["data", "collect", "--task", f"gymnasium:{task}", "--episodes", "1", "-o", str(tmp_path / "store")]
+
+    with pytest.raises(ForbesError, match="is not a package that registers environments"):
+        Experience(f"gymnasium:{task}")
+    assert main(collect) == 2
+
+    module = task.rpartition(":")[0]
+    assert f"gymnasium:{task}: {module} is not a package that registers" in capsys.readouterr().err
+    assert not stranger.exists()
+
+
+def test_an_allowed_module_registers_its_environments(stranger, tmp_path):
+    collect = ["data", "collect", "--task", "gymnasium:a_stranger:Stranger-v0", "--episodes", "1"]
+
+    assert main(["--allow-module", "a_stranger", *collect, "-o", str(tmp_path / "store")]) == 0
+
+    assert stranger.exists()
+    assert len(EpisodeStore(tmp_path / "store").records) == 1
+
+
+@pytest.mark.parametrize("module", ["minigrid", "minigrid.__init__", "minigrid.envs"])
+def test_a_package_with_an_entry_point_needs_no_permission(monkeypatch, module):
+    entry = EntryPoint("__root__", f"{module}:register_minigrid_envs", "gymnasium.envs")
+    monkeypatch.setattr("forbes.envs.tasks.entry_points", lambda group: [entry])
+
+    make = find_environment("gymnasium:minigrid:MiniGrid-Empty-5x5-v0")
+
+    assert make.args == ("minigrid:MiniGrid-Empty-5x5-v0",)
 
 
 def test_an_entry_of_a_dict_may_be_all_that_is_observed():

@@ -12,6 +12,7 @@ import torch
 from small_agents import fit, forbes, write_config
 
 from forbes.data.episode_store import EpisodeStore
+from forbes.envs import EnvironmentProcess
 from forbes.evaluation.foresight import foretell, share_explained
 from forbes.files import replace_file
 from forbes.seeding import derive_seed
@@ -75,6 +76,30 @@ def test_what_the_model_foresees_is_that_of_the_episodes_that_measure_the_agent(
     logged = read_metrics(run)["reward_explained/5"].dropna()
     assert len(logged) == 2  # after epochs 2 and 3, the last
     assert logged.iloc[-1] == pytest.approx(share, rel=1e-4)
+
+
+def test_a_run_is_loaded_without_its_environment(run, monkeypatch):
+    """The store knows the shapes; the environment starts when an episode is to be played."""
+    (record, *_) = EpisodeStore(run / "episodes").records.values()
+    with monkeypatch.context() as patch:
+        patch.setattr(EnvironmentProcess, "_start", pytest.fail)
+        _, data = load_run(run)
+        shapes = {name: getattr(data, name) for name in ("observation_shape", "action_dim", "discrete")}
+
+    assert shapes | {"observation_shape": list(shapes["observation_shape"])} == {
+        name: record.environment[name] for name in shapes
+    }
+    with data.source.environment as environment:
+        assert (environment.observation_shape, environment.action_dim, environment.discrete) == tuple(shapes.values())
+
+
+def test_a_run_without_its_episodes_asks_its_environment(run, tmp_path):
+    copy = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("episodes"))
+
+    _, data = load_run(copy)
+    data.source.close()
+
+    assert data.observation_shape == load_run(run)[1].observation_shape
 
 
 @pytest.mark.parametrize("kind", ["dreamer", "planet"])
