@@ -25,14 +25,19 @@ from forbes.pomdps import Process
 __all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "changed_defaults", "data_paths"]
 __all__ += ["experiment_parser", "require_classes"]
 
-TRUSTED = ("forbes.beliefs", "forbes.data", "forbes.models", "forbes.pomdps", "forbes.training")
-TRUSTED += ("lightning.fabric.plugins",)
-TRUSTED += tuple(f"lightning.pytorch.{part}" for part in ("accelerators", "callbacks", "loggers", "plugins"))
-TRUSTED += ("lightning.pytorch.profilers", "lightning.pytorch.strategies")
+_OF_FORBES = ("beliefs", "data", "models", "pomdps", "training")
+_OF_LIGHTNING = ("accelerators", "callbacks", "loggers", "plugins", "profilers", "strategies")
+TRUSTED = (
+    *(f"forbes.{part}" for part in _OF_FORBES),
+    *(f"lightning.pytorch.{part}" for part in _OF_LIGHTNING),
+    "lightning.fabric.plugins",
+)
 """Packages whose classes a configuration may name."""
 _REFUSED = ("*", "forbes.training.metrics_log")  # all else, and a logger that appends to whatever file it is given
-FAMILIES = (nn.Module, Likelihood, LightningDataModule, SequenceSource, Process, Callback, Logger, Profiler)
-FAMILIES += (Accelerator, CheckpointIO, ClusterEnvironment, LayerSync, Precision, Strategy)
+FAMILIES: tuple[type, ...] = (
+    *(nn.Module, Likelihood, LightningDataModule, SequenceSource, Process, Callback, Logger, Profiler),
+    *(Accelerator, CheckpointIO, ClusterEnvironment, LayerSync, Precision, Strategy),
+)
 """What these classes derive from."""
 _BY_A_CLASS = "Name a class of forbes or Lightning, or one of your own with --allow-module MODULE"
 _allowed: dict[str, None] = {}  # in their order, as long as the process lives: jsonargparse keeps them too
