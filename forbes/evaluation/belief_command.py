@@ -28,7 +28,6 @@ from forbes.training import KnownBelief
 from forbes.training.known_model import has_transition_density
 from forbes.training.loading import load_known_belief
 from forbes.training.provenance import command_line, commit
-from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
 
@@ -41,6 +40,8 @@ class _Run(NamedTuple):
     path: str
     module: KnownBelief
     data: SequenceDataModule
+    checkpoint: str
+    """SHA-256 of the checkpoint that the module was read from."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -58,7 +59,7 @@ def main(argv: Sequence[str]) -> None:
             "seed": args.seed,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "data": {"name": data_name(run.data), "sha256": sha256},
-            "checkpoint": RunFolder(run.path).checkpoint_sha256(),
+            "checkpoint": run.checkpoint,
             "seconds": round(time.monotonic() - began, 1),
         }
         names = {metric: _metric_name(run, args, metric) for metric in scores.values}
@@ -70,10 +71,10 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _load(path: str) -> _Run:
-    module, data = load_known_belief(path)
+    module, data, _, checkpoint = load_known_belief(path)
     module.require_data(data)
     read_record(path)  # a broken one is said before minutes are spent
-    return _Run(path, module.double(), data)
+    return _Run(path, module.double(), data, checkpoint)
 
 
 def _same_data(runs: Sequence[_Run], args: Any) -> str:

@@ -105,10 +105,11 @@ def _curve(run: TrainedRun) -> pd.Series:
 
 
 def _test_elbo(run: TrainedRun) -> float | None:
-    """Give the ELBO that `forbes evaluate` found on the whole test split, if it was asked and is what is drawn."""
+    """Return the ELBO that `forbes evaluate` found for this checkpoint on the whole test split, if that is drawn."""
     if not run.model.bound_name.startswith("elbo["):
         return None
-    return next((entry["mean"] for name, entry in read_record(run.path).items() if name.startswith("test/elbo[")), None)
+    own = {name: each for name, each in read_record(run.path).items() if each.get("checkpoint") == run.checkpoint}
+    return next((entry["mean"] for name, entry in own.items() if name.startswith("test/elbo[")), None)
 
 
 def _index(index: Sequence[int], size: int) -> torch.Tensor:

@@ -22,6 +22,7 @@ from forbes.figures.comparison import differences, per_step, scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
 from forbes.parsers.compare import parser
+from forbes.training.checkpoint import open_checkpoint
 from forbes.training.configuration import allowed_modules
 from forbes.training.jobs import Job, run_jobs
 from forbes.training.provenance import command_line, commit
@@ -133,7 +134,7 @@ def _fit_command(arguments: Sequence[str]) -> list[str]:
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:
     """Tell whether every metric is recorded of the run's present checkpoint, with this seed of the noise."""
-    record, checkpoint = read_record(run), RunFolder(run).checkpoint_sha256()
+    record, checkpoint = read_record(run), open_checkpoint(RunFolder(run).checkpoint).sha256
     entries = [record.get(metric, {}) for metric in metrics]
     return all(entry.get("checkpoint") == checkpoint and entry["seed"] == seed for entry in entries)
 

@@ -1,11 +1,12 @@
 """Checkpoints that survive a kill at any instant: written beside, verified, then renamed over the old one."""
 
+import hashlib
 import io
 import os
 import pickle
 import zipfile
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from lightning import LightningModule, Trainer
@@ -16,7 +17,22 @@ from forbes.errors import ForbesError
 from forbes.files import fsync_folder
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["AtomicCheckpointIO", "ResumeWholeEpochs", "SaveLast", "read_checkpoint"]
+__all__ = [
+    "AtomicCheckpointIO",
+    "CheckpointFile",
+    "ResumeWholeEpochs",
+    "SaveLast",
+    "open_checkpoint",
+    "read_checkpoint",
+]
+
+
+class CheckpointFile(NamedTuple):
+    """A checkpoint as it was read."""
+
+    content: dict[str, Any]
+    sha256: str
+    """Of the bytes that `content` was read from: the file may hold others by now."""
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -40,7 +56,7 @@ class AtomicCheckpointIO(CheckpointIO):
                 file.write(content.getbuffer())
                 file.flush()
                 os.fsync(file.fileno())
-            _verify(temporary)
+            _verify(path, temporary.read_bytes())
             temporary.replace(path)
             fsync_folder(path.parent)
         except OSError as error:
@@ -104,25 +120,31 @@ class ResumeWholeEpochs(Callback):
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Verify and read a checkpoint to the CPU.
+    """Return the content of a checkpoint; see `open_checkpoint`."""
+    return open_checkpoint(path).content
+
+
+def open_checkpoint(path: Path) -> CheckpointFile:
+    """Verify and read a checkpoint to the CPU. The file is read once, so that content and hash belong together.
 
     Raises:
         ForbesError: when the file is missing, damaged, or holds more than tensors and plain values.
     """
     if not path.is_file():
         raise ForbesError(f"{path}: no such checkpoint. Train first, or name another run")
-    _verify(path)
+    content = path.read_bytes()
+    _verify(path, content)
     try:
-        checkpoint: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        checkpoint: dict[str, Any] = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise ForbesError(f"{path}: refused, it holds more than tensors and plain values. Do not trust it") from error
-    return checkpoint
+    return CheckpointFile(checkpoint, hashlib.sha256(content).hexdigest())
 
 
-def _verify(path: Path) -> None:
+def _verify(path: Path, content: bytes) -> None:
     """Compare every checksum in the file; torch.load itself reads flipped bits without a word."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
             damaged = archive.testzip()
     except zipfile.BadZipFile as error:
         raise ForbesError(f"{path}: truncated, or no checkpoint at all ({error}). Take another one") from error

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import yaml
 from lightning import LightningModule
@@ -14,16 +14,28 @@ from forbes.data import Experience, SequenceDataModule
 from forbes.envs import EnvironmentProcess
 from forbes.errors import ForbesError
 from forbes.training.acting import ActingModel
-from forbes.training.checkpoint import read_checkpoint
+from forbes.training.checkpoint import open_checkpoint
 from forbes.training.config_errors import one_sentence, raised_inside
 from forbes.training.configuration import allow_modules, changed_defaults, data_paths, experiment_parser
 from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder
 from forbes.training.world_model import WorldModel
 
-__all__ = ["check_weights", "load_known_belief", "load_run", "loaded_agent"]
+__all__ = ["LoadedRun", "check_weights", "load_known_belief", "load_run", "loaded_agent", "open_run"]
 
 Module = TypeVar("Module", bound=LightningModule)
+
+
+class LoadedRun(NamedTuple, Generic[Module]):
+    """What was read of a run, all at one time: a training may go on, and write others over its files."""
+
+    module: Module
+    """On the CPU and in evaluation mode."""
+    data: SequenceDataModule
+    config: dict[str, Any]
+    """config.yaml."""
+    checkpoint: str
+    """SHA-256 of the checkpoint that the weights were read from, for the record of what is measured."""
 
 
 def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
@@ -36,17 +48,24 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
         ForbesError: when the folder holds no trained run or one of another kind, or its configuration and its
             checkpoint do not fit together.
     """
+    loaded = open_run(run)
+    return loaded.module, loaded.data
+
+
+def open_run(run: Path | str) -> LoadedRun[WorldModel]:
+    """Load a run as `load_run`, with what a record of its measurement must name."""
     return _load(run, WorldModel, "forbes beliefs")
 
 
-def load_known_belief(run: Path | str) -> tuple[KnownBelief, SequenceDataModule]:
-    """Load a run's belief of a known process, otherwise as `load_run`."""
+def load_known_belief(run: Path | str) -> LoadedRun[KnownBelief]:
+    """Load a run's belief of a known process, otherwise as `open_run`."""
     return _load(run, KnownBelief, "forbes evaluate")
 
 
-def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, SequenceDataModule]:
+def _load(run: Path | str, kind: type[Module], other: str) -> LoadedRun[Module]:
     folder = RunFolder.trained(run)
-    state = read_checkpoint(folder.checkpoint)["state_dict"]
+    checkpoint = open_checkpoint(folder.checkpoint)
+    state = checkpoint.content["state_dict"]
     config = yaml.safe_load(folder.config.read_text())
     for key, value in changed_defaults(config).items():
         _put(config, key, value)
@@ -73,7 +92,7 @@ def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, Sequ
         raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Measure it with: {other} {run}")
     check_weights(built.model, state, str(folder.checkpoint))
     built.model.load_state_dict(state)
-    return built.model.eval(), built.data
+    return LoadedRun(built.model.eval(), built.data, config, checkpoint.sha256)
 
 
 def _put(config: dict[str, Any], key: str, value: Any) -> None:
@@ -85,8 +104,10 @@ def _put(config: dict[str, Any], key: str, value: Any) -> None:
 
 
 @contextmanager
-def loaded_agent(run: str, device: str, samples: int | None = None) -> Iterator[tuple[ActingModel, EnvironmentProcess]]:
-    """Load a run's agent on a device, with its environment, which is closed at the end.
+def loaded_agent(
+    run: str, device: str, samples: int | None = None
+) -> Iterator[tuple[ActingModel, EnvironmentProcess, str]]:
+    """Load a run's agent on a device, with its environment, which is closed at the end, and its checkpoint's SHA-256.
 
     Args:
         run: folder.
@@ -96,14 +117,14 @@ def loaded_agent(run: str, device: str, samples: int | None = None) -> Iterator[
     Raises:
         ForbesError: where the run is not an agent's.
     """
-    module, data = load_run(run)
+    module, data, _, checkpoint = open_run(run)
     if not isinstance(module, ActingModel) or not isinstance(data.source, Experience):
         kind = type(module).__name__
         raise ForbesError(f"{run}: not the run of an agent, but of a {kind}. Name an agent's, or measure it by itself")
     module.to(device)
     module.acting_samples = samples or module.acting_samples
     try:
-        yield module, data.source.environment
+        yield module, data.source.environment, checkpoint
     finally:
         data.source.close()
 

@@ -1,6 +1,5 @@
 """Run folders: everything that one training leaves, in one place that no two processes share."""
 
-import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -83,10 +82,6 @@ class RunFolder:
         if not run.checkpoint.is_file():
             raise ForbesError(f"{run}: has no checkpoint yet. Train it: forbes fit --config {run.config}")
         return run
-
-    def checkpoint_sha256(self) -> str:
-        """Hash the checkpoint: it tells what was measured."""
-        return hashlib.sha256(self.checkpoint.read_bytes()).hexdigest()
 
     @contextmanager
     def locked(self) -> Iterator[None]:
