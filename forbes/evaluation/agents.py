@@ -22,7 +22,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.foresight import SAMPLES, STEPS_AHEAD, explained, foretell
 from forbes.evaluation.gaussianity import prior_and_posterior
-from forbes.evaluation.record import write_record
+from forbes.evaluation.record import require_readable, write_record
 from forbes.evaluation.reward_uncertainty import exact_variance, learned_variance, uncertainty
 from forbes.pomdps import Process
 from forbes.seeding import derive_seed
@@ -84,6 +84,7 @@ def evaluate_agents(
     """
     if episodes < 2:
         raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
+    require_readable(runs.values())
     played = list[_Played]()
     for run, folder in runs.items():
         with loaded_agent(run, device, samples) as (agent, environment, checkpoint):

@@ -18,7 +18,7 @@ from forbes.evaluation.belief_errors import ERRORS, Belief, belief_errors, mode_
 from forbes.evaluation.bounds import Increments
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.progress import with_progress
-from forbes.evaluation.record import describe, read_record, write_record
+from forbes.evaluation.record import describe, require_readable, write_record
 from forbes.evaluation.runs import data_name, data_sha256, split_batches
 from forbes.evaluation.scoring import Scores, require_finite
 from forbes.parsers.beliefs import parser
@@ -47,6 +47,7 @@ class _Run(NamedTuple):
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
+    require_readable(args.runs)
     runs = [_load(path) for path in args.runs]
     sha256 = _same_data(runs, args)
     table = _table(args)
@@ -73,7 +74,6 @@ def main(argv: Sequence[str]) -> None:
 def _load(path: str) -> _Run:
     module, data, _, checkpoint = load_known_belief(path)
     module.require_data(data)
-    read_record(path)  # a broken one is said before minutes are spent
     return _Run(path, module.double(), data, checkpoint)
 
 

@@ -17,7 +17,7 @@ from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.measured import SCORES, Measured, note, pair
 from forbes.evaluation.progress import with_progress
-from forbes.evaluation.record import describe, read_record, results_folders, write_record
+from forbes.evaluation.record import describe, require_readable, results_folders, write_record
 from forbes.evaluation.references import references
 from forbes.evaluation.round_trip import model_round_trip, print_round_trip
 from forbes.evaluation.runs import (
@@ -78,10 +78,9 @@ def evaluate(
         folders: where the record of each run goes; into the run by default.
     """
     folders = folders or results_folders(paths)
+    require_readable(folders.values())
     runs = load_runs(paths, find_device(args.device))
     jobs = _jobs(args, runs)
-    for run in runs:
-        read_record(folders[run.path])  # a broken one is said before minutes are spent
     finished: list[Parts] = []
     measured = []
     for number, run in enumerate(runs):

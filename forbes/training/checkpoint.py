@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint
 
 from forbes.errors import ForbesError
 from forbes.files import fsync_folder
+from forbes.reading import readable
 from forbes.training.run_folder import RunFolder
 
 __all__ = [
@@ -134,19 +135,19 @@ def open_checkpoint(path: Path) -> CheckpointFile:
         raise ForbesError(f"{path}: no such checkpoint. Train first, or name another run")
     content = path.read_bytes()
     _verify(path, content)
-    try:
-        checkpoint: dict[str, Any] = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise ForbesError(f"{path}: refused, it holds more than tensors and plain values. Do not trust it") from error
+    with readable(path, "a checkpoint", "Take another one"):
+        try:
+            checkpoint: dict[str, Any] = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError as error:
+            raise ForbesError(
+                f"{path}: refused, it holds more than tensors and plain values. Do not trust it"
+            ) from error
     return CheckpointFile(checkpoint, hashlib.sha256(content).hexdigest())
 
 
 def _verify(path: Path, content: bytes) -> None:
     """Compare every checksum in the file; torch.load itself reads flipped bits without a word."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            damaged = archive.testzip()
-    except zipfile.BadZipFile as error:
-        raise ForbesError(f"{path}: truncated, or no checkpoint at all ({error}). Take another one") from error
+    with readable(path, "a checkpoint", "Take another one"), zipfile.ZipFile(io.BytesIO(content)) as archive:
+        damaged = archive.testzip()
     if damaged is not None:
         raise ForbesError(f"{path}: the checkpoint is damaged (wrong checksum of {damaged}). Take another one")

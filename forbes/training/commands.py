@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from jsonargparse import DefaultHelpFormatter
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import CheckpointIO
@@ -27,13 +26,13 @@ from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.parsers.fit import DESCRIPTION, run_options
 from forbes.training.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
-from forbes.training.config_errors import one_sentence, raised_inside, said_by_lightning
+from forbes.training.config_errors import building, one_sentence, raised_inside, said_by_lightning
 from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults, data_paths
 from forbes.training.loading import check_weights
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
-from forbes.training.provenance import RecordRun
-from forbes.training.run_folder import RunFolder, experiment_name
+from forbes.training.provenance import RecordRun, read_provenance
+from forbes.training.run_folder import RunFolder, experiment_name, read_config
 from forbes.training.stop import StopOnSignal
 from forbes.training.trainer_arguments import require_usable
 
@@ -119,7 +118,7 @@ class _Experiment(LightningCLI):
         if command != "fit":
             rest = list(arguments)
         elif self.resumed:
-            older = changed_defaults(yaml.safe_load(self.resumed.config.read_text()))
+            older = changed_defaults(read_config(self.resumed.config))
             flags = [part for key, value in older.items() for part in (f"--{key}", str(value))]
             rest = ["--config", str(self.resumed.config), *flags, *rest]
         super().__init__(
@@ -158,10 +157,21 @@ class _Experiment(LightningCLI):
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse; Lightning's own would warn that the process has arguments, too. A run knows its data from anywhere."""
-        self.config = parser.parse_args(args)
+        with building(self._where()):
+            self.config = parser.parse_args(args)
         data = self.config["data"]
         for key, path in data_paths(data).items():
             data[key] = str(Path(path).absolute())
+
+    def instantiate_classes(self) -> None:
+        """Build what the configuration names."""
+        with building(self._where()):
+            super().instantiate_classes()
+
+    def _where(self) -> str:
+        """Name the configuration."""
+        files = [value for flag, value in itertools.pairwise(self.arguments) if flag in ("--config", "-c", "--resume")]
+        return " and ".join(files) or "the configuration"
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Build the trainer; for `fit` with a run folder and all that fills it."""
@@ -207,6 +217,8 @@ class _Experiment(LightningCLI):
         self.stack.enter_context(run.locked())
         if not self.resumed and run.checkpoint.exists():
             raise ForbesError(f"{run}: holds a trained run. Name another, or go on with it: forbes fit --resume {run}")
+        if run.provenance.is_file():
+            read_provenance(run.provenance)  # a broken one is said before the training begins
         return run
 
     def execute(self) -> int:

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
-import yaml
 from lightning import LightningModule
 from torch import Tensor, nn
 
@@ -15,10 +14,10 @@ from forbes.envs import EnvironmentProcess
 from forbes.errors import ForbesError
 from forbes.training.acting import ActingModel
 from forbes.training.checkpoint import open_checkpoint
-from forbes.training.config_errors import one_sentence, raised_inside
+from forbes.training.config_errors import building, one_sentence
 from forbes.training.configuration import allow_modules, changed_defaults, data_paths, experiment_parser
 from forbes.training.known_model import KnownBelief
-from forbes.training.run_folder import RunFolder
+from forbes.training.run_folder import RunFolder, read_config
 from forbes.training.world_model import WorldModel
 
 __all__ = ["LoadedRun", "check_weights", "load_known_belief", "load_run", "loaded_agent", "open_run"]
@@ -66,27 +65,23 @@ def _load(run: Path | str, kind: type[Module], other: str) -> LoadedRun[Module]:
     folder = RunFolder.trained(run)
     checkpoint = open_checkpoint(folder.checkpoint)
     state = checkpoint.content["state_dict"]
-    config = yaml.safe_load(folder.config.read_text())
+    config = read_config(folder.config)
     for key, value in changed_defaults(config).items():
         _put(config, key, value)
     allow_modules()
     parser = experiment_parser()
+    sections = {key: config[key] for key in ("seed_everything", "model", "data") if key in config}
     try:
-        parsed = parser.parse_object(
-            {key: config[key] for key in ("seed_everything", "model", "data") if key in config}
-        )
+        with building(str(folder.config)):
+            parsed = parser.parse_object(sections)
     except argparse.ArgumentError as error:
         raise ForbesError(f"{folder.config}: {one_sentence(str(error))}") from error
     for key, path in data_paths(parsed["data"]).items():
         if not Path(path).exists():
             name = "data." + key.replace("init_args.", "")
             raise ForbesError(f"{folder.config}: {name} is {path}, which is not there. Set it to where the data are")
-    try:
+    with building(str(folder.config)):
         built = parser.instantiate(parsed)
-    except ValueError as error:
-        if inner := raised_inside(error):
-            raise inner from None
-        raise
     if not isinstance(built.model, kind):
         found = type(built.model).__name__
         raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Measure it with: {other} {run}")
