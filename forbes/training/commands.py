@@ -28,6 +28,7 @@ from forbes.parsers.fit import DESCRIPTION, run_options
 from forbes.training.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
 from forbes.training.config_errors import building, one_sentence, raised_inside, said_by_lightning
 from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults, data_paths
+from forbes.training.divergence import StopAtDivergence
 from forbes.training.loading import check_weights
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
@@ -196,7 +197,7 @@ class _Experiment(LightningCLI):
         print(f"run folder: {run}", flush=True)
         self.stop = StopOnSignal(run)
         self.save_config_kwargs = {"run": run, "stop": self.stop, "arguments": [self.command, *self.arguments]}
-        callbacks += [ResumeWholeEpochs(), MarkStart(), self.stop]
+        callbacks += [ResumeWholeEpochs(), MarkStart(), self.stop, StopAtDivergence(run)]
         if config["enable_checkpointing"] is not False:
             callbacks.append(SaveLast(run))
         loggers = config["logger"]

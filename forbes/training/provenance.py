@@ -75,7 +75,7 @@ class RecordRun(SaveConfigCallback):
         if self.stop.received is not None:
             self._end(self.stop.exit_status)
         else:
-            self._end(2 if isinstance(exception, ForbesError) else 1)
+            self._end(exception.exit_status if isinstance(exception, ForbesError) else 1)
 
     def _end(self, exit_status: int) -> None:
         if self.already_saved:

@@ -24,6 +24,7 @@ class RunFolder:
         provenance.json    what was run, when, by which versions, on what data: one entry for each start
         metrics.jsonl      one JSON object a line: {"update": n, "epoch": e, name: value, ...}
         checkpoints/       last.ckpt
+        failure.pt         after a divergence: weights, batch and seed of the update whose loss is not finite
         figures/
         evaluation.json    and evaluation.npz, what `forbes evaluate` has measured
         evaluation-best/   the same of another checkpoint, here checkpoints/best.ckpt
@@ -43,6 +44,7 @@ class RunFolder:
         self.config = self.path / "config.yaml"
         self.provenance = self.path / "provenance.json"
         self.metrics = self.path / "metrics.jsonl"
+        self.failure = self.path / "failure.pt"
         last = self.path / "checkpoints" / "last.ckpt"
         self.checkpoint = chosen or last
         self.results = self.path if self.checkpoint == last else self.path / f"evaluation-{self.checkpoint.stem}"
