@@ -19,7 +19,7 @@ _REASON = 120  # characters of what a parser says
 
 
 @contextmanager
-def readable(path: Path | str, kind: str, remedy: str) -> Iterator[None]:
+def readable(path: Path | str, kind: str, remedy: str, raises: type[ForbesError] = ForbesError) -> Iterator[None]:
     """Turn whatever a parser raises on damaged bytes into one sentence.
 
     Parsers raise errors of any class on bytes they were not made for. So all are caught, and nothing but parsing
@@ -29,6 +29,7 @@ def readable(path: Path | str, kind: str, remedy: str) -> Iterator[None]:
         path: of the file.
         kind: what it should be, e.g. "JSON".
         remedy: what to do about it, the error's last sentence.
+        raises: the class of the error.
 
     Raises:
         ForbesError: for any error inside.
@@ -39,7 +40,7 @@ def readable(path: Path | str, kind: str, remedy: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = shortened(str(error), _REASON) or type(error).__name__
-        raise ForbesError(f"{path}: truncated or not {kind} ({reason}). {remedy}") from error
+        raise raises(f"{path}: truncated or not {kind} ({reason}). {remedy}") from error
 
 
 def shortened(text: str, length: int) -> str:

@@ -29,7 +29,7 @@ from forbes.training.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, Sa
 from forbes.training.config_errors import building, one_sentence, raised_inside, said_by_lightning
 from forbes.training.configuration import add_links, add_seed, allow_modules, changed_defaults, data_paths
 from forbes.training.divergence import StopAtDivergence
-from forbes.training.loading import check_weights
+from forbes.training.loading import check_weights, weights_of
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
 from forbes.training.provenance import RecordRun, read_provenance
@@ -228,7 +228,7 @@ class _Experiment(LightningCLI):
         updates = 0
         if checkpoint:
             content = read_checkpoint(Path(checkpoint))
-            check_weights(self.model, content["state_dict"], str(checkpoint))
+            check_weights(self.model, weights_of(content, str(checkpoint)), str(checkpoint))
             updates = content["global_step"]
         how = {"datamodule": self.datamodule, "ckpt_path": checkpoint, "weights_only": True}
         if self.command in ("validate", "test"):

@@ -20,7 +20,7 @@ from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder, read_config
 from forbes.training.world_model import WorldModel
 
-__all__ = ["LoadedRun", "check_weights", "load_known_belief", "load_run", "loaded_agent", "open_run"]
+__all__ = ["LoadedRun", "check_weights", "load_known_belief", "load_run", "loaded_agent", "open_run", "weights_of"]
 
 Module = TypeVar("Module", bound=LightningModule)
 
@@ -64,7 +64,7 @@ def load_known_belief(run: Path | str) -> LoadedRun[KnownBelief]:
 def _load(run: Path | str, kind: type[Module], other: str) -> LoadedRun[Module]:
     folder = RunFolder.trained(run)
     checkpoint = open_checkpoint(folder.checkpoint)
-    state = checkpoint.content["state_dict"]
+    state = weights_of(checkpoint.content, str(folder.checkpoint))
     config = read_config(folder.config)
     for key, value in changed_defaults(config).items():
         _put(config, key, value)
@@ -122,6 +122,19 @@ def loaded_agent(
         yield module, data.source.environment, checkpoint
     finally:
         data.source.close()
+
+
+def weights_of(content: Any, name: str) -> dict[str, Tensor]:
+    """Return the weights in a checkpoint.
+
+    Raises:
+        ForbesError: where it is not the checkpoint of a training.
+    """
+    state = content.get("state_dict") if isinstance(content, dict) else None
+    tensors = isinstance(state, dict) and all(isinstance(values, Tensor) for values in state.values())
+    if not tensors or not isinstance(content.get("global_step"), int):
+        raise ForbesError(f"{name}: has no state_dict of tensors and global_step, expected those of a training")
+    return dict(state)
 
 
 def check_weights(model: nn.Module, state: Mapping[str, Tensor], name: str) -> None:

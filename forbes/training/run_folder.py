@@ -23,7 +23,7 @@ class RunFolder:
         config.yaml        the whole configuration, defaults included
         provenance.json    what was run, when, by which versions, on what data: one entry for each start
         metrics.jsonl      one JSON object a line: {"update": n, "epoch": e, name: value, ...}
-        checkpoints/       last.ckpt
+        checkpoints/       last.ckpt, and previous.ckpt, which is read where the last one is damaged
         failure.pt         after a divergence: weights, batch and seed of the update whose loss is not finite
         figures/
         evaluation.json    and evaluation.npz, what `forbes evaluate` has measured
@@ -37,6 +37,8 @@ class RunFolder:
             instead of the last one.
     """
 
+    LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
+
     def __init__(self, path: Path | str) -> None:
         path = Path(path)
         chosen = path if path.suffix == ".ckpt" else None
@@ -45,7 +47,7 @@ class RunFolder:
         self.provenance = self.path / "provenance.json"
         self.metrics = self.path / "metrics.jsonl"
         self.failure = self.path / "failure.pt"
-        last = self.path / "checkpoints" / "last.ckpt"
+        last = self.path / "checkpoints" / self.LAST
         self.checkpoint = chosen or last
         self.results = self.path if self.checkpoint == last else self.path / f"evaluation-{self.checkpoint.stem}"
         self.figures = self.path / "figures"
