@@ -5,6 +5,7 @@ so many sequences), the score, the likelihood and the numbers of samples: `test[
 Measuring a metric again replaces its entry.
 """
 
+import fcntl
 import io
 import json
 import os
@@ -134,10 +135,17 @@ def read_arrays(run: str | Path) -> dict[str, NDArray[np.float64]]:
 
 
 def write_record(run: str | Path, entries: dict[str, dict[str, Any]], totals: dict[str, Tensor]) -> None:
-    """Replace entries of `evaluation.json`, and the scores of each sequence, `(N,)`, in `evaluation.npz`."""
-    record = read_record(run) | entries
-    arrays = read_arrays(run) | {name: values.numpy() for name, values in totals.items()}
-    content = io.BytesIO()
-    np.savez(content, **arrays)
-    replace_file(RunFolder(run).results / "evaluation.npz", content.getvalue())
-    replace_file(RunFolder(run).results / "evaluation.json", (json.dumps(record, indent=2) + "\n").encode())
+    """Replace entries of `evaluation.json`, and the scores of each sequence, `(N,)`, in `evaluation.npz`.
+
+    Evaluations that end together wait for each other, so that the entries of all are kept.
+    """
+    folder = RunFolder(run).results
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".evaluation.lock").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
+        record = read_record(run) | entries
+        arrays = read_arrays(run) | {name: values.numpy() for name, values in totals.items()}
+        content = io.BytesIO()
+        np.savez(content, **arrays)
+        replace_file(folder / "evaluation.npz", content.getvalue())
+        replace_file(folder / "evaluation.json", (json.dumps(record, indent=2) + "\n").encode())
