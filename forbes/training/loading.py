@@ -131,10 +131,11 @@ def weights_of(content: Any, name: str) -> dict[str, Tensor]:
         ForbesError: where it is not the checkpoint of a training.
     """
     state = content.get("state_dict") if isinstance(content, dict) else None
-    tensors = isinstance(state, dict) and all(isinstance(values, Tensor) for values in state.values())
-    if not tensors or not isinstance(content.get("global_step"), int):
-        raise ForbesError(f"{name}: has no state_dict of tensors and global_step, expected those of a training")
-    return dict(state)
+    if not isinstance(state, dict) or not all(isinstance(values, Tensor) for values in state.values()):
+        raise ForbesError(f"{name}: has no state_dict of tensors, expected that of a training. Take another one")
+    if not isinstance(content.get("global_step"), int):
+        raise ForbesError(f"{name}: does not say its global_step, expected the checkpoint of a training")
+    return state
 
 
 def check_weights(model: nn.Module, state: Mapping[str, Tensor], name: str) -> None:
