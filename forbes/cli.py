@@ -69,7 +69,9 @@ options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and give its exit status: 0, 2 for an error the user can mend, 130 or 143 for a signal.
+    """Run the command line and return its exit status.
+
+    That is 0, 2 for an error the user can mend, 3 for a training that diverged, 130 or 143 for a signal.
 
     Args:
         arguments: without the program's name; those of the process by default.
@@ -82,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if debug:
             raise
         print(f"forbes: {_sentence(error)}", file=sys.stderr)
-        return 2
+        return error.exit_status if isinstance(error, ForbesError) else 2
     except (KeyboardInterrupt, SystemExit) as error:
         interrupt = error if isinstance(error, KeyboardInterrupt) else error.__context__  # Lightning exits with 1
         if debug or not isinstance(interrupt, KeyboardInterrupt):

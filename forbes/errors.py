@@ -7,5 +7,7 @@ class ForbesError(Exception):
     """Bad input or a bad environment.
 
     The message is one clear sentence: where, what, what was expected, what to do. The command line prints it
-    as ``forbes: <message>`` and exits with code 2; ``--debug`` shows the traceback.
+    as ``forbes: <message>`` and exits with `exit_status`; ``--debug`` shows the traceback.
     """
+
+    exit_status = 2

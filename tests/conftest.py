@@ -1,5 +1,6 @@
 """What several tests need: one thread, and a few digits that nobody has to read from the disk."""
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import torch
 
 from forbes.cli import main
 from forbes.data.stroke_file import StrokeArrays, save_strokes
-from forbes.training import configuration
+from forbes.training import configuration, loading
+from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
 
 torch.set_num_threads(1)  # a second thread gains nothing on matrices of this size
 
@@ -85,6 +87,20 @@ def tiny_run(tiny_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     run = tmp_path_factory.mktemp("runs") / "tiny"
     assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run)]) == 0
     return run
+
+
+@pytest.fixture
+def overwritten(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Let a training go on while its run is measured; gives the hash of each checkpoint that was read, by its path."""
+    read: dict[str, str] = {}
+
+    def check_weights(model: object, state: object, name: str) -> None:
+        read[name] = hashlib.sha256(Path(name).read_bytes()).hexdigest()
+        content = read_checkpoint(Path(name))
+        AtomicCheckpointIO().save_checkpoint(content | {"global_step": content["global_step"] + 1}, name)
+
+    monkeypatch.setattr(loading, "check_weights", check_weights)
+    return read
 
 
 @pytest.fixture

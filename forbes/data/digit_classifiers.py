@@ -11,9 +11,6 @@ classifier has seen both sets, and strokes that are shifted, broken or grey, as 
 """
 
 import hashlib
-import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -25,6 +22,7 @@ from torch import Tensor, nn
 
 from forbes.errors import ForbesError
 from forbes.files import npz_bytes, replace_file
+from forbes.reading import read_npz
 
 __all__ = ["CLASSES", "CLASSIFIERS_SHA256", "DigitClassifier", "Judges", "calibration_error", "classifiers_path"]
 __all__ += ["load_judges", "save_weights"]
@@ -86,11 +84,7 @@ def load_judges(origin: Literal["bundled", "dejong"]) -> Judges:
     remedy = "Restore it from the repository, or install forbes again"
     if not path.is_file():
         raise ForbesError(f"{path}: there is no such file. {remedy}")
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-            weights = dict(arrays)
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise ForbesError(f"{path}: truncated or not a file of weights ({error}). {remedy}") from error
+    weights = read_npz(path, remedy)
     if (found := _sha256(weights)) != CLASSIFIERS_SHA256:
         raise ForbesError(f"{path}: weights of sha256 {found[:16]}…, expected {CLASSIFIERS_SHA256[:16]}…. {remedy}")
     judges = Judges(DigitClassifier(1), DigitClassifier(2))

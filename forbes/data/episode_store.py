@@ -83,7 +83,7 @@ class EpisodeStore:
         for place, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):  # a kill may cut the last
             try:
                 self._apply(json.loads(line))
-            except (ValueError, TypeError, KeyError, AttributeError) as error:
+            except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
                 raise ForbesError(
                     f"{self.index}: line {place} is not a line of the index. Delete it; the episode's file stays"
                 ) from error
@@ -92,10 +92,13 @@ class EpisodeStore:
         """Follow one line of the index."""
         if "number" in line:
             record = EpisodeRecord(**line)
+            record.require_types()
             self.records[record.number] = record
             self.watermark = record.number + 1
             return
         ((event, number),) = line.items()
+        if type(number) is not int:
+            raise TypeError(number)
         if event == "quarantined":
             self.records.pop(number, None)
         elif event == "set_aside_from":

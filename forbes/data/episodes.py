@@ -11,6 +11,7 @@ import math
 import mmap
 import struct
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
+from forbes.reading import is_number
 from forbes.shapes import printed_by_shape
 
 __all__ = ["DamagedEpisodeError", "Episode", "EpisodeRecord", "map_episode", "missing_in", "pack_episode"]
@@ -55,6 +57,15 @@ class Episode(NamedTuple):
         return float(self.reward.sum(dtype="float64"))
 
 
+_FITS: dict[Any, Callable[[Any], bool]] = {
+    int: lambda value: type(value) is int and value >= 0,
+    float: is_number,
+    bool: lambda value: type(value) is bool,
+    str: lambda value: type(value) is str,
+    dict[str, Any]: lambda value: type(value) is dict,
+}
+
+
 class EpisodeRecord(NamedTuple):
     """What the index says of an episode; a line of `index.jsonl`."""
 
@@ -75,6 +86,12 @@ class EpisodeRecord(NamedTuple):
     """Bytes of the file."""
     sha256: str
     """Of the file."""
+
+    def require_types(self) -> None:
+        """Raise a TypeError where a value is not of its field's type, as in a damaged line of an index."""
+        for name, kind in type(self).__annotations__.items():
+            if not _FITS[kind](getattr(self, name)):
+                raise TypeError(name)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -127,9 +127,12 @@ class Experience(SequenceSource):
         return record
 
     def forget(self) -> None:
-        """Delete the episodes beyond the capacity, which are drawn no more; a checkpoint must know of the newest."""
+        """Delete the episodes beyond the capacity, which are drawn no more; a checkpoint must know of the newest.
+
+        The checkpoint before it, which lacks the newest, may still be read: what it draws from stays.
+        """
         writer = self._open()
-        writer.forget(first_held(writer.records.values(), self.capacity))
+        writer.forget(first_held([*writer.records.values()][:-1], self.capacity))
         self._look()
 
     def begun(self, policy: str, seed: int, most: int) -> int:

@@ -13,7 +13,6 @@ For each split ``S`` in ``train``, ``test``:
 import hashlib
 import io
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
 from forbes.files import npz_bytes, replace_file
+from forbes.reading import readable
 from forbes.shapes import printed_by_shape
 
 __all__ = ["SIDE", "StrokeArrays", "check_strokes", "load_strokes", "save_strokes", "sha256_of_arrays"]
@@ -67,25 +67,19 @@ def load_strokes(path: Path, remedy: str) -> dict[str, StrokeArrays]:
     """
     if not path.is_file():
         raise ForbesError(f"{path}: there is no such file. {remedy}")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            splits = {
-                split: StrokeArrays(*(_read_array(archive, f"{split}_{name}") for name in _EXPECTED))
-                for split in ("train", "test")
-            }
-    except KeyError as error:
-        raise ForbesError(f"{path}: {error.args[0]}. {remedy}") from error
-    except (OSError, EOFError, ValueError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise ForbesError(f"{path}: truncated or not a stroke file ({error}). {remedy}") from error
+    with readable(path, "a stroke file", remedy), zipfile.ZipFile(path) as archive:
+        splits = {
+            split: StrokeArrays(*(_read_array(archive, path, f"{split}_{name}", remedy) for name in _EXPECTED))
+            for split in ("train", "test")
+        }
     check_strokes(splits, path, remedy)
     return splits
 
 
-def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    try:
-        member = archive.getinfo(f"{name}.npy")
-    except KeyError:
-        raise KeyError(f'array "{name}" is missing') from None
+def _read_array(archive: zipfile.ZipFile, path: Path, name: str, remedy: str) -> NDArray[Any]:
+    if f"{name}.npy" not in archive.namelist():
+        raise ForbesError(f'{path}: array "{name}" is missing. {remedy}')
+    member = archive.getinfo(f"{name}.npy")
     if member.file_size > _MEMBER_LIMIT:
         raise ValueError(f'array "{name}" has {member.file_size} bytes, expected at most {_MEMBER_LIMIT}')
     return np.lib.format.read_array(io.BytesIO(archive.read(member)), allow_pickle=False)

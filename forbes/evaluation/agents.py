@@ -22,14 +22,13 @@ from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.foresight import SAMPLES, STEPS_AHEAD, explained, foretell
 from forbes.evaluation.gaussianity import prior_and_posterior
-from forbes.evaluation.record import write_record
+from forbes.evaluation.record import require_readable, write_record
 from forbes.evaluation.reward_uncertainty import exact_variance, learned_variance, uncertainty
 from forbes.pomdps import Process
 from forbes.seeding import derive_seed
 from forbes.training.acting import ActingModel, play_measured
 from forbes.training.loading import load_run, loaded_agent
 from forbes.training.provenance import commit
-from forbes.training.run_folder import RunFolder
 
 __all__ = ["evaluate_agents", "is_agent", "play_test_episode"]
 
@@ -52,6 +51,8 @@ class _Played(NamedTuple):
     """What is said of the belief, by metric: `_DISTANCES` from a Gaussian, where s is
     continuous, and `_REWARD`, where the exact belief is known."""
     environment: dict[str, Any]
+    checkpoint: str
+    """SHA-256 of the one that has played."""
 
 
 def is_agent(run: str) -> bool:
@@ -83,17 +84,20 @@ def evaluate_agents(
     """
     if episodes < 2:
         raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
+    require_readable(runs.values())
     played = list[_Played]()
     for run, folder in runs.items():
-        with loaded_agent(run, device, samples) as (agent, environment):
+        with loaded_agent(run, device, samples) as (agent, environment, checkpoint):
             for first in played[:1]:
                 _require_same_task(first, run, describe_environment(environment))
-            played.append(_play(run, agent, environment, episodes, seed))
+            played.append(_play(run, agent, environment, checkpoint, episodes, seed))
         _record(played[-1], folder, seed, command)
     _print(played)
 
 
-def _play(run: str, agent: ActingModel, environment: EnvironmentProcess, episodes: int, seed: int) -> _Played:
+def _play(
+    run: str, agent: ActingModel, environment: EnvironmentProcess, checkpoint: str, episodes: int, seed: int
+) -> _Played:
     returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
     process, variances, distances = _known_process(environment), list[tuple[Tensor, Tensor]](), list[Tensor]()
     for number in _counted(run, episodes):
@@ -112,7 +116,9 @@ def _play(run: str, agent: ActingModel, environment: EnvironmentProcess, episode
         belief |= zip(_DISTANCES, map(Estimate.of, torch.stack(distances, 1)), strict=True)  # 2 x (E,)
     if variances:
         belief[_REWARD] = uncertainty(*zip(*variances, strict=True))
-    return _Played(run, agent, total, explained(foretold, rewards), belief, describe_environment(environment))
+    return _Played(
+        run, agent, total, explained(foretold, rewards), belief, describe_environment(environment), checkpoint
+    )
 
 
 def _known_process(environment: EnvironmentProcess) -> Process | None:
@@ -125,7 +131,7 @@ def _known_process(environment: EnvironmentProcess) -> Process | None:
 
 def _record(one: _Played, folder: Path, seed: int, command: str) -> None:
     measured = {
-        "checkpoint": RunFolder(one.run).checkpoint_sha256(),
+        "checkpoint": one.checkpoint,
         "command": command,
         "commit": commit(),
         "seed": seed,

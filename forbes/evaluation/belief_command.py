@@ -18,7 +18,7 @@ from forbes.evaluation.belief_errors import ERRORS, Belief, belief_errors, mode_
 from forbes.evaluation.bounds import Increments
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.progress import with_progress
-from forbes.evaluation.record import describe, read_record, write_record
+from forbes.evaluation.record import describe, require_readable, write_record
 from forbes.evaluation.runs import data_name, data_sha256, split_batches
 from forbes.evaluation.scoring import Scores, require_finite
 from forbes.parsers.beliefs import parser
@@ -28,7 +28,6 @@ from forbes.training import KnownBelief
 from forbes.training.known_model import has_transition_density
 from forbes.training.loading import load_known_belief
 from forbes.training.provenance import command_line, commit
-from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
 
@@ -41,11 +40,14 @@ class _Run(NamedTuple):
     path: str
     module: KnownBelief
     data: SequenceDataModule
+    checkpoint: str
+    """SHA-256 of the checkpoint that the module was read from."""
 
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
+    require_readable(args.runs)
     runs = [_load(path) for path in args.runs]
     sha256 = _same_data(runs, args)
     table = _table(args)
@@ -58,7 +60,7 @@ def main(argv: Sequence[str]) -> None:
             "seed": args.seed,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "data": {"name": data_name(run.data), "sha256": sha256},
-            "checkpoint": RunFolder(run.path).checkpoint_sha256(),
+            "checkpoint": run.checkpoint,
             "seconds": round(time.monotonic() - began, 1),
         }
         names = {metric: _metric_name(run, args, metric) for metric in scores.values}
@@ -70,10 +72,9 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _load(path: str) -> _Run:
-    module, data = load_known_belief(path)
+    module, data, _, checkpoint = load_known_belief(path)
     module.require_data(data)
-    read_record(path)  # a broken one is said before minutes are spent
-    return _Run(path, module.double(), data)
+    return _Run(path, module.double(), data, checkpoint)
 
 
 def _same_data(runs: Sequence[_Run], args: Any) -> str:

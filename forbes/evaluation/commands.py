@@ -17,7 +17,7 @@ from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.measured import SCORES, Measured, note, pair
 from forbes.evaluation.progress import with_progress
-from forbes.evaluation.record import describe, read_record, results_folders, write_record
+from forbes.evaluation.record import describe, require_readable, results_folders, write_record
 from forbes.evaluation.references import references
 from forbes.evaluation.round_trip import model_round_trip, print_round_trip
 from forbes.evaluation.runs import (
@@ -33,7 +33,6 @@ from forbes.evaluation.scoring import Parts, Pass, exact_pass, make_pass, score_
 from forbes.evaluation.tables import print_degradation, print_pairs, print_references, print_runs
 from forbes.parsers.evaluate import PASSES, SUBSET, parser
 from forbes.training.provenance import command_line, commit
-from forbes.training.run_folder import RunFolder
 
 __all__ = ["evaluate", "main", "wanted_metrics"]
 
@@ -79,10 +78,9 @@ def evaluate(
         folders: where the record of each run goes; into the run by default.
     """
     folders = folders or results_folders(paths)
+    require_readable(folders.values())
     runs = load_runs(paths, find_device(args.device))
     jobs = _jobs(args, runs)
-    for run in runs:
-        read_record(folders[run.path])  # a broken one is said before minutes are spent
     finished: list[Parts] = []
     measured = []
     for number, run in enumerate(runs):
@@ -197,7 +195,14 @@ def _round_trip(run: TrainedRun, args: Any) -> dict[str, dict[str, Any]]:
     _, batch = next(split_batches(run.data, args.split, _count(run, args, args.batch_size), args.batch_size))
     found = model_round_trip(run.model, batch, args.seed)
     print_round_trip(run.path, found)
-    return {f"{args.split}/round_trip": found | {"sequences": len(batch.mask), "seed": args.seed}} if found else {}
+    return (
+        {
+            f"{args.split}/round_trip": found
+            | {"sequences": len(batch.mask), "seed": args.seed, "checkpoint": run.checkpoint}
+        }
+        if found
+        else {}
+    )
 
 
 def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
@@ -211,8 +216,7 @@ def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
 def _measure(one: Measured, job: _Job, sha256: str, args: Any, folder: Path) -> Parts:
     """Make a pass for a run and add what it finds; give the parts it has left, to be removed in the end."""
     run, score = one.run, job.score
-    checkpoint = RunFolder(run.path).checkpoint_sha256()
-    parts = Parts(folder / "evaluation-parts", checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed)
+    parts = Parts(folder / "evaluation-parts", run.checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed)
     began = time.monotonic()
     batches = split_batches(run.data, args.split, job.sequences, score.batch_size)
     batches = with_progress(batches, f"{run.path} {job.name}", job.sequences)
@@ -222,7 +226,7 @@ def _measure(one: Measured, job: _Job, sha256: str, args: Any, folder: Path) -> 
         one.totals[name] = scores.total(metric)
         one.entries[name] = describe(scores, metric) | {
             "data": {"name": data_name(run.data), "sha256": sha256},
-            "checkpoint": checkpoint,
+            "checkpoint": run.checkpoint,
             "device": str(next(run.model.parameters()).device),
             "seconds": round(time.monotonic() - began, 1),
         }

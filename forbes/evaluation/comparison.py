@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import torch
+from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
 from forbes.evaluation.degradation import at_horizons, degradation
@@ -20,6 +21,8 @@ from forbes.evaluation.measured import SCORES, score_of
 from forbes.evaluation.record import read_arrays, read_record
 
 __all__ = ["Comparison", "Family", "compare", "markdown"]
+
+_NEEDED = ("mean", "standard_error", "sequences", "per_step", "curve", "data")
 
 
 class Family(NamedTuple):
@@ -83,6 +86,8 @@ def _entries(family: Family, metric: str) -> list[dict[str, Any]]:
         record = read_record(run)
         if metric not in record:
             raise ForbesError(f"{run}: evaluation.json has no {metric}. Measure it: forbes evaluate {run}")
+        if lacking := [field for field in _NEEDED if field not in record[metric]]:
+            raise ForbesError(f"{run}: the {metric} of evaluation.json has no {lacking[0]}. Measure it again")
         entries.append(record[metric])
     return entries
 
@@ -95,10 +100,11 @@ def _blank(other: dict[str, Any]) -> dict[str, Any]:
 def _require_same_data(
     metric: str, families: Sequence[Family], entries: Mapping[str, Sequence[dict[str, Any]]]
 ) -> None:
-    expected = entries[families[0].name][0]["data"]
+    first = entries[families[0].name][0]
+    expected, steps = first["data"], len(first["curve"])
     for family in families:
         for run, entry in zip(family.runs.values(), entries[family.name], strict=True):
-            if entry["data"]["sha256"] != expected["sha256"]:
+            if (entry["data"]["sha256"], len(entry["curve"])) != (expected["sha256"], steps):
                 raise ForbesError(
                     f"{run}: {metric} was measured on {entry['data']['name']}, expected {expected['name']} as for "
                     f"{families[0].name}. Compare runs of the same data"
@@ -121,10 +127,24 @@ def _paired(family: Family, first: Family, metric: str) -> list[dict[str, Any]]:
     """Give the paired differences of the seeds that both families have."""
     rows = []
     for seed in (seed for seed in family.runs if seed in first.runs):
-        values = read_arrays(family.runs[seed])[metric] - read_arrays(first.runs[seed])[metric]  # (N,)
+        one, other = (_array(run, metric) for run in (family.runs[seed], first.runs[seed]))
+        if one.shape != other.shape:
+            raise ForbesError(
+                f"{family.runs[seed]}: evaluation.npz has {len(one)} sequences of {metric}, {first.runs[seed]} "
+                f"{len(other)}, expected the same. Measure both again"
+            )
+        values = one - other  # (N,)
         difference = Estimate.of(torch.from_numpy(values))._asdict()
         rows.append({"family": family.name, "metric": metric, "seed": seed, **difference})
     return rows
+
+
+def _array(run: str, metric: str) -> NDArray[np.float64]:
+    """Return the score of each sequence, `(N,)`."""
+    arrays = read_arrays(run)
+    if metric not in arrays:
+        raise ForbesError(f"{run}: evaluation.npz has no {metric}. Measure it: forbes evaluate {run}")
+    return arrays[metric]
 
 
 def markdown(comparison: Comparison, families: Sequence[Family]) -> str:

@@ -5,10 +5,11 @@ so many sequences), the score, the likelihood and the numbers of samples: `test[
 Measuring a metric again replaces its entry.
 """
 
+import fcntl
 import io
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,12 @@ from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.scoring import Scores
 from forbes.files import replace_file
+from forbes.reading import is_number, read_json, read_npz, shortened
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["describe", "read_arrays", "read_record", "results_folders", "write_record"]
+__all__ = ["describe", "read_arrays", "read_record", "require_readable", "results_folders", "write_record"]
+
+_REMEDY = "Delete it and evaluate again"
 
 
 def describe(scores: Scores, metric: str) -> dict[str, Any]:
@@ -67,31 +71,81 @@ def results_folders(runs: Sequence[str], output: str | None = None) -> dict[str,
 
 
 def read_record(run: str | Path) -> dict[str, Any]:
-    """Read `evaluation.json`; a run that was never evaluated has an empty one."""
+    """Read `evaluation.json`; a run that was never evaluated has an empty one.
+
+    Raises:
+        ForbesError: where it is not JSON, or an entry is not what an evaluation writes.
+    """
     path = RunFolder(run).results / "evaluation.json"
     if not path.exists():
         return {}
-    try:
-        record: dict[str, Any] = json.loads(path.read_text())
-    except ValueError as error:
-        raise ForbesError(f"{path}: not JSON ({error}). Delete it and evaluate again") from error
+    record = read_json(path, _REMEDY)
+    if not isinstance(record, dict):
+        raise ForbesError(f"{path}: holds a {type(record).__name__}, expected entries by metric. {_REMEDY}")
+    for name, entry in record.items():
+        if not isinstance(entry, dict):
+            raise ForbesError(f"{path}: {shortened(name, 80)} is no entry of an evaluation. {_REMEDY}")
+        for field, fits in _FIELDS.items():
+            if field in entry and not fits(entry[field]):
+                raise ForbesError(f"{path}: the {field} of {shortened(name, 80)} is not one. {_REMEDY}")
     return record
 
 
+def _is_estimate(value: Any) -> bool:
+    """Tell whether this is an `Estimate`; of infinite errors both numbers are null."""
+    if not isinstance(value, dict) or not {"mean", "standard_error"} <= value.keys():
+        return False
+    return all(value[name] is None or is_number(value[name]) for name in ("mean", "standard_error"))
+
+
+_FIELDS: dict[str, Callable[[Any], bool]] = {
+    "mean": lambda value: value is None or is_number(value),
+    "standard_error": lambda value: value is None or is_number(value),
+    "per_step": _is_estimate,
+    "curve": lambda value: isinstance(value, list) and all(map(is_number, value)),
+    "sequences": lambda value: isinstance(value, int),
+    "seed": lambda value: isinstance(value, int),
+    "checkpoint": lambda value: isinstance(value, str),
+    "data": lambda value: (
+        isinstance(value, dict) and all(isinstance(value.get(key), str) for key in ("name", "sha256"))
+    ),
+    "references": lambda value: isinstance(value, dict) and all(map(_is_estimate, value.values())),
+}
+"""What those who read an entry may take for granted of each field, where it is there."""
+
+
+def require_readable(folders: Iterable[str | Path]) -> None:
+    """Read what earlier evaluations have left, to say what is broken before minutes are spent."""
+    for folder in folders:
+        read_record(folder)
+        read_arrays(folder)
+
+
 def read_arrays(run: str | Path) -> dict[str, NDArray[np.float64]]:
-    """Read `evaluation.npz`, the scores of each sequence by metric; none before the first evaluation."""
+    """Read `evaluation.npz`, the scores of each sequence by metric, `(N,)`; none before the first evaluation."""
     path = RunFolder(run).results / "evaluation.npz"
     if not path.exists():
         return {}
-    with np.load(path, allow_pickle=False) as arrays:
-        return dict(arrays)
+    arrays = read_npz(path, _REMEDY)
+    for name, array in arrays.items():
+        if array.dtype != np.float64 or array.ndim != 1:
+            found = f"{array.dtype} {array.shape}"
+            raise ForbesError(f"{path}: {shortened(name, 80)} is {found}, expected float64 (N,). {_REMEDY}")
+    return arrays
 
 
 def write_record(run: str | Path, entries: dict[str, dict[str, Any]], totals: dict[str, Tensor]) -> None:
-    """Replace entries of `evaluation.json`, and the scores of each sequence, `(N,)`, in `evaluation.npz`."""
-    record = read_record(run) | entries
-    arrays = read_arrays(run) | {name: values.numpy() for name, values in totals.items()}
-    content = io.BytesIO()
-    np.savez(content, **arrays)
-    replace_file(RunFolder(run).results / "evaluation.npz", content.getvalue())
-    replace_file(RunFolder(run).results / "evaluation.json", (json.dumps(record, indent=2) + "\n").encode())
+    """Replace entries of `evaluation.json`, and the scores of each sequence, `(N,)`, in `evaluation.npz`.
+
+    Evaluations that end together wait for each other, so that the entries of all are kept.
+    """
+    folder = RunFolder(run).results
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".evaluation.lock").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
+        record = read_record(run) | entries
+        arrays = read_arrays(run) | {name: values.numpy() for name, values in totals.items()}
+        content = io.BytesIO()
+        np.savez(content, **arrays)
+        replace_file(folder / "evaluation.npz", content.getvalue())
+        replace_file(folder / "evaluation.json", (json.dumps(record, indent=2) + "\n").encode())

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-import yaml
 from torch import nn
 
 from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
 from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
 from forbes.models import BeliefModel, ParticleModel, StateSpaceModel, VectorModel
-from forbes.training.loading import load_run
-from forbes.training.run_folder import RunFolder
+from forbes.training.loading import open_run
 
 __all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "require_comparable", "run_titles"]
 __all__ += ["split_batches"]
@@ -38,6 +36,8 @@ class TrainedRun(NamedTuple):
     """As the user gave it."""
     model: BeliefModel
     data: SequenceDataModule
+    checkpoint: str
+    """SHA-256 of the checkpoint that the model was read from."""
     config: dict[str, Any]
     """Sections `model` and `data` of config.yaml without the seeds: runs that differ in the seed only have the same."""
 
@@ -93,10 +93,9 @@ def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
     """Load runs, their models on a device."""
     runs = []
     for path in paths:
-        module, data = load_run(path)
-        config = yaml.safe_load(RunFolder(path).config.read_text())
+        module, data, config, checkpoint = open_run(path)
         sections = {key: _without_seed(config[key]) for key in ("model", "data")}
-        runs.append(TrainedRun(path, module.model.to(device), data, sections))
+        runs.append(TrainedRun(path, module.model.to(device), data, checkpoint, sections))
     return runs
 
 

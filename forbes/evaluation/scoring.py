@@ -22,6 +22,7 @@ from forbes.evaluation.smc import score_particles
 from forbes.files import replace_file
 from forbes.models import BeliefModel, StateSpaceModel
 from forbes.pomdps import Process
+from forbes.reading import read_npz
 from forbes.seeding import derive_seed
 
 __all__ = ["Parts", "Pass", "Scores", "exact_pass", "make_pass", "require_finite", "score_split"]
@@ -124,8 +125,8 @@ class Parts:
         path = self._path(first)
         if not path.exists():
             return None
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: torch.from_numpy(values) for name, values in arrays.items()}
+        arrays = read_npz(path, f"Delete {self.folder}, and evaluate again")
+        return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
     def write(self, first: int, scores: Increments) -> None:
         """Keep the scores of a batch."""

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pandas as pd
 import torch
-import yaml
 from matplotlib.figure import Figure
 
 from forbes.data import Strokes
@@ -21,7 +20,7 @@ from forbes.figures.returns import returns_against_env_steps
 from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
 from forbes.figures.style import PALETTE, save_figure
 from forbes.parsers.figures import parser
-from forbes.training.run_folder import RunFolder, read_metrics
+from forbes.training.run_folder import RunFolder, read_config, read_metrics
 
 __all__ = ["main"]
 
@@ -66,16 +65,23 @@ def _agents(runs: Sequence[str]) -> tuple[str, dict[str, list[pd.Series]]]:
     tasks = set()
     for run in runs:
         metrics = read_metrics(run)
-        if "return/acting" not in metrics:
+        if not {"env_steps", "return/acting"} <= {*metrics}:
             raise ForbesError(f"{run}: metrics.jsonl has no return/acting. Name runs of agents that were measured")
-        source = yaml.safe_load(RunFolder(run).config.read_text())["data"]["init_args"]["source"]
-        tasks.add(source["init_args"]["task"])
+        tasks.add(_task(RunFolder(run).config))
         name = re.sub(r"-\d+$", "", Path(run).absolute().name)
         measured = metrics[["env_steps", "return/acting"]].dropna()
         curves.setdefault(name, []).append(measured.set_index("env_steps")["return/acting"])
     if len(tasks) > 1:
         raise ForbesError(f"--runs: they are of {' and '.join(sorted(tasks))}, expected one task. Draw each by itself")
     return tasks.pop(), curves
+
+
+def _task(path: Path) -> str:
+    """Return the task of an agent's data, as its configuration says it."""
+    try:
+        return str(read_config(path)["data"]["init_args"]["source"]["init_args"]["task"])
+    except (KeyError, TypeError) as error:
+        raise ForbesError(f"{path}: its data have no task, expected Experience. Name runs of agents") from error
 
 
 def group(runs: Sequence[TrainedRun]) -> list[Family]:
@@ -105,10 +111,11 @@ def _curve(run: TrainedRun) -> pd.Series:
 
 
 def _test_elbo(run: TrainedRun) -> float | None:
-    """Give the ELBO that `forbes evaluate` found on the whole test split, if it was asked and is what is drawn."""
+    """Return the ELBO that `forbes evaluate` found for this checkpoint on the whole test split, if that is drawn."""
     if not run.model.bound_name.startswith("elbo["):
         return None
-    return next((entry["mean"] for name, entry in read_record(run.path).items() if name.startswith("test/elbo[")), None)
+    own = {name: each for name, each in read_record(run.path).items() if each.get("checkpoint") == run.checkpoint}
+    return next((entry["mean"] for name, entry in own.items() if name.startswith("test/elbo[")), None)
 
 
 def _index(index: Sequence[int], size: int) -> torch.Tensor:

@@ -22,10 +22,11 @@ from forbes.figures.comparison import differences, per_step, scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
 from forbes.parsers.compare import parser
+from forbes.training.checkpoint import open_checkpoint
 from forbes.training.configuration import allowed_modules
 from forbes.training.jobs import Job, run_jobs
 from forbes.training.provenance import command_line, commit
-from forbes.training.run_folder import RunFolder
+from forbes.training.run_folder import RunFolder, read_config
 
 __all__ = ["main"]
 
@@ -97,7 +98,7 @@ def _require_same_configuration(run: str, config: str, seed: int, flags: Sequenc
 
     Callbacks do not count, since they watch; nor do keys that the run's version of this package did not have.
     """
-    own = _flat(yaml.safe_load(RunFolder(run).config.read_text()))
+    own = _flat(read_config(RunFolder(run).config))
     own |= {key: str(Path(own[key]).absolute()) for key in own if key.endswith(".path") and own[key]}
     asked = _flat(yaml.safe_load(_configuration(config, *flags))) | {key: seed for key in _SEEDS}
     asked |= {key: str(Path(asked[key]).absolute()) for key in asked if key.endswith(".path") and asked[key]}
@@ -133,9 +134,9 @@ def _fit_command(arguments: Sequence[str]) -> list[str]:
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:
     """Tell whether every metric is recorded of the run's present checkpoint, with this seed of the noise."""
-    record, checkpoint = read_record(run), RunFolder(run).checkpoint_sha256()
+    record, checkpoint = read_record(run), open_checkpoint(RunFolder(run).checkpoint).sha256
     entries = [record.get(metric, {}) for metric in metrics]
-    return all(entry.get("checkpoint") == checkpoint and entry["seed"] == seed for entry in entries)
+    return all(entry.get("checkpoint") == checkpoint and entry.get("seed") == seed for entry in entries)
 
 
 def _write(comparison: Comparison, families: Sequence[Family], folder: Path, command: str) -> None:

@@ -17,7 +17,6 @@ from forbes.figures.style import save_figure
 from forbes.files import replace_file
 from forbes.parsers.completions import parser
 from forbes.training.provenance import command_line, commit
-from forbes.training.run_folder import RunFolder
 
 __all__ = ["main"]
 
@@ -71,8 +70,7 @@ def _check(args: Any, runs: Sequence[TrainedRun]) -> None:
 
 
 def _describe(name: str, run: TrainedRun) -> dict[str, Any]:
-    checkpoint = RunFolder(run.path).checkpoint_sha256()
-    return {"row": name, "path": run.path, "parameters": run.parameters, "checkpoint": checkpoint}
+    return {"row": name, "path": run.path, "parameters": run.parameters, "checkpoint": run.checkpoint}
 
 
 def _write(args: Any, record: dict[str, Any], studies: Sequence[Study]) -> None:

@@ -1,8 +1,8 @@
 """What an agent earns while it learns, against the frames it has seen, beside curves that others have published."""
 
-import json
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
@@ -12,6 +12,7 @@ from matplotlib.ticker import EngFormatter
 from forbes.data.published import curves_path
 from forbes.errors import ForbesError
 from forbes.figures.style import COLUMN, GREY, ORANGE, PALETTE, draw_range, paper_style
+from forbes.reading import read_json, readable
 
 __all__ = ["published_curves", "return_curve", "returns_against_env_steps"]
 
@@ -90,18 +91,16 @@ def published_curves(path: str | None, task: str) -> dict[str, list[pd.Series]]:
     names = {task, f"dmc_{task}", f"dmc_{task.removeprefix('ball_in_')}"}  # Dreamer's name of it is cup_catch
     curves: dict[str, list[pd.Series]] = {}
     known = set()
-    try:
-        with open(path or curves_path()) as file:
-            for one in json.load(file):
-                known.add(one["task"])
-                if one["task"] in names:
-                    curve = pd.Series(one["ys"], index=one["xs"], dtype=float)
-                    curves.setdefault(one["method"], []).append(curve)
-    except OSError as error:
-        raise ForbesError(f"{path}: no such file of curves that can be read. Name another, or none") from error
-    except (ValueError, KeyError, TypeError) as error:
-        expected = "a JSON list of task, method, seed, xs and ys"
-        raise ForbesError(f"{path}: not a file of curves, expected {expected}. Name another, or none") from error
+    file, remedy = Path(path or curves_path()), "Name another, or none"
+    if not file.is_file():
+        raise ForbesError(f"{file}: no such file of curves that can be read. {remedy}")
+    found = read_json(file, remedy)
+    with readable(file, "a file of curves, expected a JSON list of task, method, seed, xs and ys", remedy):
+        for one in found:
+            known.add(one["task"])
+            if one["task"] in names:
+                curve = pd.Series(one["ys"], index=one["xs"], dtype=float)
+                curves.setdefault(one["method"], []).append(curve)
     if path and not curves:
         listed = ", ".join(sorted(known)) or "nothing"
         raise ForbesError(f"{path}: has no curve of {task}, but of {listed}. Name another file, or none")

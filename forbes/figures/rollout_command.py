@@ -22,7 +22,7 @@ def main(argv: Sequence[str]) -> None:
             f"--video {args.video}: it ends in {args.video.suffix or 'nothing'}, expected .gif. Rename it"
         )
     frames = []
-    with loaded_agent(args.run, find_device(args.device), args.acting_samples) as (agent, environment):
+    with loaded_agent(args.run, find_device(args.device), args.acting_samples) as (agent, environment, _):
         remedy = f"Train on pixels; the return is told by: forbes evaluate {args.run}"
         require_images(args.run, environment.observation_shape, remedy)
         for number in range(args.episodes):

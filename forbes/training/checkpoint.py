@@ -1,11 +1,14 @@
 """Checkpoints that survive a kill at any instant: written beside, verified, then renamed over the old one."""
 
+import hashlib
 import io
 import os
 import pickle
+import shutil
+import sys
 import zipfile
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from lightning import LightningModule, Trainer
@@ -14,9 +17,33 @@ from lightning.pytorch.callbacks import Callback, Checkpoint
 
 from forbes.errors import ForbesError
 from forbes.files import replace_file
+from forbes.reading import readable
 from forbes.training.run_folder import RunFolder
 
-__all__ = ["AtomicCheckpointIO", "ResumeWholeEpochs", "SaveLast", "read_checkpoint"]
+__all__ = [
+    "AtomicCheckpointIO",
+    "CheckpointFile",
+    "ResumeWholeEpochs",
+    "SaveLast",
+    "open_checkpoint",
+    "read_checkpoint",
+]
+
+
+class CheckpointFile(NamedTuple):
+    """A checkpoint as it was read."""
+
+    content: dict[str, Any]
+    sha256: str
+    """Of the bytes that `content` was read from: the file may hold others by now."""
+
+
+class DamagedCheckpointError(ForbesError):
+    """A file is not what was written."""
+
+
+class UntrustedCheckpointError(ForbesError):
+    """A file holds more than tensors and plain values."""
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -31,10 +58,16 @@ class AtomicCheckpointIO(CheckpointIO):
     ) -> None:
         """Write another file in the same folder, verify it, and rename it to `path`."""
         path = Path(path)
-        content = io.BytesIO()  # written to a full disk directly, torch.save fails without saying why
-        torch.save(checkpoint, content)
+        buffer = io.BytesIO()  # written to a full disk directly, torch.save fails without saying why
+        torch.save(checkpoint, buffer)
+
+        def keep_the_one_before(written: Path) -> None:
+            _verify(path, written.read_bytes())
+            if path.name == RunFolder.LAST and path.exists():
+                _keep_previous(path)
+
         try:
-            replace_file(path, content.getbuffer(), _verify)
+            replace_file(path, _sealed(buffer.getvalue()), keep_the_one_before)
         except OSError as error:
             raise ForbesError(
                 f"{path}: the checkpoint cannot be written ({error.strerror}), the one before it is untouched. "
@@ -53,7 +86,7 @@ class AtomicCheckpointIO(CheckpointIO):
 
 
 class SaveLast(Checkpoint):
-    """Saves after each epoch, over the checkpoint before.
+    """Saves after each epoch; the checkpoint before becomes `previous.ckpt`.
 
     Lightning's `ModelCheckpoint` remembers where it saved, and is lost in a run folder that was moved.
 
@@ -95,27 +128,86 @@ class ResumeWholeEpochs(Callback):
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Verify and read a checkpoint to the CPU.
+    """Return the content of a checkpoint; see `open_checkpoint`."""
+    return open_checkpoint(path).content
+
+
+def open_checkpoint(path: Path) -> CheckpointFile:
+    """Verify and read a checkpoint to the CPU. The file is read once, so that content and hash belong together.
+
+    Where `last.ckpt` is damaged, the one before it is read, and stderr says so.
 
     Raises:
         ForbesError: when the file is missing, damaged, or holds more than tensors and plain values.
     """
+    previous = path.with_name(RunFolder.PREVIOUS)
+    try:
+        return _open(path)
+    except DamagedCheckpointError as error:
+        if path.name != RunFolder.LAST or not previous.is_file():
+            raise
+        found = _open(previous)
+        print(f"WARNING: {error}: reading {previous}", file=sys.stderr)
+        return found
+
+
+def _open(path: Path) -> CheckpointFile:
     if not path.is_file():
         raise ForbesError(f"{path}: no such checkpoint. Train first, or name another run")
-    _verify(path)
-    try:
-        checkpoint: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise ForbesError(f"{path}: refused, it holds more than tensors and plain values. Do not trust it") from error
-    return checkpoint
+    content = path.read_bytes()
+    _verify(path, content)
+    with readable(path, "a checkpoint", "Take another one", DamagedCheckpointError):
+        try:
+            checkpoint: dict[str, Any] = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError as error:
+            raise UntrustedCheckpointError(
+                f"{path}: refused, it holds more than tensors and plain values. Do not trust it"
+            ) from error
+    return CheckpointFile(checkpoint, hashlib.sha256(content).hexdigest())
 
 
-def _verify(path: Path) -> None:
-    """Compare every checksum in the file; torch.load itself reads flipped bits without a word."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-    except zipfile.BadZipFile as error:
-        raise ForbesError(f"{path}: truncated, or no checkpoint at all ({error}). Take another one") from error
+def _verify(path: Path, content: bytes) -> None:
+    """Compare the file with its seal; torch.load itself reads flipped bits without a word.
+
+    A file without one, of an older version or other software, has the checksums of its members. They leave out the
+    directory, where a flipped bit makes a member a folder, of which torch reads zeros.
+    """
+    with (
+        readable(path, "a checkpoint", "Take another one", DamagedCheckpointError),
+        zipfile.ZipFile(io.BytesIO(content)) as archive,
+    ):
+        damaged = archive.testzip() or next((m.filename for m in archive.infolist() if m.external_attr & _FOLDER), None)
+        whole = not archive.comment or _sealed(content[: -len(archive.comment) - 2] + b"\0\0") == content
     if damaged is not None:
-        raise ForbesError(f"{path}: the checkpoint is damaged (wrong checksum of {damaged}). Take another one")
+        raise DamagedCheckpointError(
+            f"{path}: the checkpoint is damaged (wrong checksum of {damaged}). Take another one"
+        )
+    if not whole:
+        raise DamagedCheckpointError(
+            f"{path}: truncated or damaged (its SHA-256 is not what it says). Take another one"
+        )
+
+
+_FOLDER = 0x10  # of the attributes of a member
+_SEAL = b"sha256 "
+
+
+def _sealed(content: bytes) -> bytes:
+    """Append the hash of a zip file to it, as the archive's comment, whose length are the last two bytes before."""
+    begun = content[:-2] + (len(_SEAL) + 64).to_bytes(2, "little") + _SEAL
+    return begun + hashlib.sha256(begun).hexdigest().encode()
+
+
+def _keep_previous(path: Path) -> None:
+    """Keep the checkpoint that will be overwritten, unless it is damaged: then the one before it is worth more."""
+    try:
+        _verify(path, path.read_bytes())
+    except DamagedCheckpointError:
+        return
+    aside = path.with_name(f".{RunFolder.PREVIOUS}.part")
+    aside.unlink(missing_ok=True)
+    try:
+        os.link(path, aside)
+    except OSError:  # a file system without hard links
+        shutil.copyfile(path, aside)
+    aside.replace(path.with_name(RunFolder.PREVIOUS))

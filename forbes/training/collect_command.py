@@ -50,7 +50,7 @@ def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, M
             raise ForbesError(
                 f"--policy {policy}: an agent acts in the environment of its run, expected no {flag}. Leave it out"
             )
-        with loaded_agent(policy, "cpu") as (agent, environment):
+        with loaded_agent(policy, "cpu") as (agent, environment, _):
             yield environment, Acting(agent, exploring=True)
     elif "task" not in given:
         raise ForbesError(f"--policy {_RANDOM}: needs an environment. Name one: --task TASK")

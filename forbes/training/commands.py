@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from jsonargparse import DefaultHelpFormatter
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import CheckpointIO
@@ -27,7 +26,7 @@ from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.parsers.fit import DESCRIPTION, run_options
 from forbes.training.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
-from forbes.training.config_errors import one_sentence, raised_inside, said_by_lightning
+from forbes.training.config_errors import building, one_sentence, raised_inside, said_by_lightning
 from forbes.training.configuration import (
     add_links,
     add_seed,
@@ -36,11 +35,12 @@ from forbes.training.configuration import (
     data_paths,
     require_classes,
 )
-from forbes.training.loading import check_weights
+from forbes.training.divergence import StopAtDivergence
+from forbes.training.loading import check_weights, weights_of
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
-from forbes.training.provenance import RecordRun
-from forbes.training.run_folder import RunFolder, experiment_name
+from forbes.training.provenance import RecordRun, read_provenance
+from forbes.training.run_folder import RunFolder, experiment_name, read_config
 from forbes.training.stop import StopOnSignal
 from forbes.training.trainer_arguments import require_usable
 
@@ -126,7 +126,7 @@ class _Experiment(LightningCLI):
         if command != "fit":
             rest = list(arguments)
         elif self.resumed:
-            older = changed_defaults(yaml.safe_load(self.resumed.config.read_text()))
+            older = changed_defaults(read_config(self.resumed.config))
             flags = [part for key, value in older.items() for part in (f"--{key}", str(value))]
             rest = ["--config", str(self.resumed.config), *flags, *rest]
         super().__init__(
@@ -165,12 +165,23 @@ class _Experiment(LightningCLI):
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse; Lightning's own would warn that the process has arguments, too. A run knows its data from anywhere."""
-        self.config = parser.parse_args(args)
+        with building(self._where()):
+            self.config = parser.parse_args(args)
         for section in ("model", "data", "trainer"):
             require_classes(self.config[section], section)
         data = self.config["data"]
         for key, path in data_paths(data).items():
             data[key] = str(Path(path).absolute())
+
+    def instantiate_classes(self) -> None:
+        """Build what the configuration names."""
+        with building(self._where()):
+            super().instantiate_classes()
+
+    def _where(self) -> str:
+        """Name the configuration."""
+        files = [value for flag, value in itertools.pairwise(self.arguments) if flag in ("--config", "-c", "--resume")]
+        return " and ".join(files) or "the configuration"
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Build the trainer; for `fit` with a run folder and all that fills it."""
@@ -195,7 +206,7 @@ class _Experiment(LightningCLI):
         print(f"run folder: {run}", flush=True)
         self.stop = StopOnSignal(run)
         self.save_config_kwargs = {"run": run, "stop": self.stop, "arguments": [self.command, *self.arguments]}
-        callbacks += [ResumeWholeEpochs(), MarkStart(), self.stop]
+        callbacks += [ResumeWholeEpochs(), MarkStart(), self.stop, StopAtDivergence(run)]
         if config["enable_checkpointing"] is not False:
             callbacks.append(SaveLast(run))
         loggers = config["logger"]
@@ -216,6 +227,8 @@ class _Experiment(LightningCLI):
         self.stack.enter_context(run.locked())
         if not self.resumed and run.checkpoint.exists():
             raise ForbesError(f"{run}: holds a trained run. Name another, or go on with it: forbes fit --resume {run}")
+        if run.provenance.is_file():
+            read_provenance(run.provenance)  # a broken one is said before the training begins
         return run
 
     def execute(self) -> int:
@@ -224,7 +237,7 @@ class _Experiment(LightningCLI):
         updates = 0
         if checkpoint:
             content = read_checkpoint(Path(checkpoint))
-            check_weights(self.model, content["state_dict"], str(checkpoint))
+            check_weights(self.model, weights_of(content, str(checkpoint)), str(checkpoint))
             updates = content["global_step"]
         how = {"datamodule": self.datamodule, "ckpt_path": checkpoint, "weights_only": True}
         if self.command in ("validate", "test"):

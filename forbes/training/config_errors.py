@@ -1,12 +1,14 @@
 """Errors of the configuration, from jsonargparse's pages to one sentence that names the nearest valid word."""
 
+import argparse
 import difflib
 import inspect
 import itertools
 import pydoc
 import re
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
@@ -15,8 +17,11 @@ from torch import nn
 
 from forbes.data import SequenceDataModule, SequenceSource
 from forbes.errors import ForbesError
+from forbes.reading import shortened
 
-__all__ = ["one_sentence", "raised_inside", "said_by_lightning"]
+__all__ = ["building", "one_sentence", "raised_inside", "said_by_lightning"]
+
+_LENGTH = 200  # characters of a sentence without its place; some of the libraries print a whole configuration
 
 TOP_LEVEL = ("model", "data", "trainer", "seed_everything", "config", "ckpt_path")
 SECTIONS = {"data.source": SequenceSource, "data": SequenceDataModule, "trainer": Trainer, "model": LightningModule}
@@ -36,7 +41,7 @@ def one_sentence(message: str, arguments: Sequence[str] = ()) -> str:
     if found := re.search(r"[Oo]ption '([\w.]+)'|unrecognized arguments: --([\w.]+)", message):
         key, sentence = _unknown_option(message, keys, found[1] or found[2])
     elif found := re.search(r"Expected a dot import path string: (\S*)|has no attribute '(\w+)'", message):
-        key, sentence = ".".join(keys), _unknown_class(found[1] or found[2])
+        key, sentence = ".".join(keys), _unknown_class(found[1] or found[2] or "''")
     elif found := re.search(r"Importing '([\w.]+)' is not allowed", message):
         module = found[1].rpartition(".")[0]
         key = ".".join(keys)
@@ -47,7 +52,7 @@ def one_sentence(message: str, arguments: Sequence[str] = ()) -> str:
         return f"{found[1]}: no such file. See configs/ for those that come with forbes"
     else:
         key, sentence = ".".join(keys), _wrong_value(message)
-    return f"{_place(key, arguments)}{key + ': ' if key else ''}{sentence}"
+    return f"{_place(key, arguments)}{key + ': ' if key else ''}{shortened(sentence, _LENGTH)}"
 
 
 def _supply(key: str, missing: str) -> str:
@@ -127,7 +132,7 @@ def _wrong_value(message: str) -> str:
     if expected is None:
         return " ".join(message.replace('in "<unicode string>", line', "at line").split())
     kind = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", expected[1]).replace("typing.Literal", "one of ")
-    return f"is {expected[2]}, expected {kind.replace(', NoneType', ' or null')}"
+    return f"is {shortened(expected[2], 80)}, expected {kind.replace(', NoneType', ' or null')}"
 
 
 def _place(key: str, arguments: Sequence[str]) -> str:
@@ -138,7 +143,7 @@ def _place(key: str, arguments: Sequence[str]) -> str:
     configs = [value for flag, value in itertools.pairwise(arguments) if flag in ("--config", "-c")]
     word = re.compile(rf"\b{re.escape(key.rpartition('.')[2])}\b")
     for config in configs[::-1]:
-        if len(configs) == 1 or word.search(Path(config).read_text()):
+        if len(configs) == 1 or word.search(Path(config).read_text(errors="replace")):
             return f"{config}: "
     return ""
 
@@ -149,6 +154,28 @@ def raised_inside(error: BaseException) -> ForbesError | None:
     while inner is not None and not isinstance(inner, ForbesError):
         inner = inner.__cause__
     return inner
+
+
+@contextmanager
+def building(where: str) -> Iterator[None]:
+    """Turn an error inside a class that a configuration names into one sentence.
+
+    Args:
+        where: the configuration's name.
+
+    Raises:
+        ForbesError: what the class or Lightning has said, or which error it has raised.
+    """
+    try:
+        yield
+    except argparse.ArgumentError:
+        raise
+    except Exception as error:
+        if inner := raised_inside(error):
+            raise inner from None
+        cause = f"{type(error).__name__}: {shortened(str(error), 120)}"
+        said = said_by_lightning(error) or f"{where}: what it names cannot be built ({cause}). Change it; see --debug"
+        raise ForbesError(said) from error
 
 
 def said_by_lightning(error: BaseException) -> str | None:

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import torch
 from lightning import LightningModule
 from torch import Tensor
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from forbes.beliefs import BeliefFamily
@@ -19,6 +19,7 @@ from forbes.pomdps.base import require_positive
 from forbes.pomdps.distributions import PointMass
 from forbes.precision import full_precision
 from forbes.seeding import derive_seed, generator
+from forbes.training.divergence import hold_unless_finite
 from forbes.training.world_model import batches_before, follow_rates
 
 __all__ = ["KnownBelief", "Objective", "has_transition_density"]
@@ -143,6 +144,11 @@ class KnownBelief(LightningModule):
         optimizer = Adam(self.parameters(), lr=self.learning_rate, fused=True)
         scheduler = LambdaLR(optimizer, self._rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
+        """Make no step where the gradient is not finite."""
+        gradients = [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
+        hold_unless_finite(optimizer, torch.nn.utils.get_total_norm(gradients), self.global_step)
 
     def on_train_start(self) -> None:
         """See `WorldModel.on_train_start`."""

@@ -5,9 +5,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
-import yaml
 from lightning import LightningModule
 from torch import Tensor, nn
 
@@ -15,8 +14,8 @@ from forbes.data import Experience, SequenceDataModule
 from forbes.envs import EnvironmentProcess
 from forbes.errors import ForbesError
 from forbes.training.acting import ActingModel
-from forbes.training.checkpoint import read_checkpoint
-from forbes.training.config_errors import one_sentence, raised_inside
+from forbes.training.checkpoint import open_checkpoint
+from forbes.training.config_errors import building, one_sentence
 from forbes.training.configuration import (
     allow_modules,
     changed_defaults,
@@ -25,12 +24,24 @@ from forbes.training.configuration import (
     require_classes,
 )
 from forbes.training.known_model import KnownBelief
-from forbes.training.run_folder import RunFolder
+from forbes.training.run_folder import RunFolder, read_config
 from forbes.training.world_model import WorldModel
 
-__all__ = ["check_weights", "load_known_belief", "load_run", "loaded_agent"]
+__all__ = ["LoadedRun", "check_weights", "load_known_belief", "load_run", "loaded_agent", "open_run", "weights_of"]
 
 Module = TypeVar("Module", bound=LightningModule)
+
+
+class LoadedRun(NamedTuple, Generic[Module]):
+    """What was read of a run, all at one time: a training may go on, and write others over its files."""
+
+    module: Module
+    """On the CPU and in evaluation mode."""
+    data: SequenceDataModule
+    config: dict[str, Any]
+    """config.yaml."""
+    checkpoint: str
+    """SHA-256 of the checkpoint that the weights were read from, for the record of what is measured."""
 
 
 def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
@@ -43,47 +54,51 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
         ForbesError: when the folder holds no trained run or one of another kind, or its configuration and its
             checkpoint do not fit together.
     """
+    loaded = open_run(run)
+    return loaded.module, loaded.data
+
+
+def open_run(run: Path | str) -> LoadedRun[WorldModel]:
+    """Load a run as `load_run`, with what a record of its measurement must name."""
     return _load(run, WorldModel, "forbes beliefs")
 
 
-def load_known_belief(run: Path | str) -> tuple[KnownBelief, SequenceDataModule]:
-    """Load a run's belief of a known process, otherwise as `load_run`."""
+def load_known_belief(run: Path | str) -> LoadedRun[KnownBelief]:
+    """Load a run's belief of a known process, otherwise as `open_run`."""
     return _load(run, KnownBelief, "forbes evaluate")
 
 
-def _load(run: Path | str, kind: type[Module], other: str) -> tuple[Module, SequenceDataModule]:
+def _load(run: Path | str, kind: type[Module], other: str) -> LoadedRun[Module]:
     folder = RunFolder.trained(run)
-    state = read_checkpoint(folder.checkpoint)["state_dict"]
-    config = yaml.safe_load(folder.config.read_text())
+    checkpoint = open_checkpoint(folder.checkpoint)
+    state = weights_of(checkpoint.content, str(folder.checkpoint))
+    config = read_config(folder.config)
     for key, value in changed_defaults(config).items():
         _put(config, key, value)
     allow_modules()
     parser = experiment_parser()
+    sections = {key: config[key] for key in ("seed_everything", "model", "data") if key in config}
     try:
-        parsed = parser.parse_object(
-            {key: config[key] for key in ("seed_everything", "model", "data") if key in config}
-        )
-        require_classes(parsed)
+        with building(str(folder.config)):
+            parsed = parser.parse_object(sections)
     except argparse.ArgumentError as error:
         raise ForbesError(f"{folder.config}: {one_sentence(str(error))}") from error
+    try:
+        require_classes(parsed)
     except ForbesError as error:
         raise ForbesError(f"{folder.config}: {error}") from error
     for key, path in data_paths(parsed["data"]).items():
         if not Path(path).exists():
             name = "data." + key.replace("init_args.", "")
             raise ForbesError(f"{folder.config}: {name} is {path}, which is not there. Set it to where the data are")
-    try:
+    with building(str(folder.config)):
         built = parser.instantiate(parsed, instantiators=[(partial(_recalled, folder.path), Experience, True)])
-    except ValueError as error:
-        if inner := raised_inside(error):
-            raise inner from None
-        raise
     if not isinstance(built.model, kind):
         found = type(built.model).__name__
         raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Measure it with: {other} {run}")
     check_weights(built.model, state, str(folder.checkpoint))
     built.model.load_state_dict(state)
-    return built.model.eval(), built.data
+    return LoadedRun(built.model.eval(), built.data, config, checkpoint.sha256)
 
 
 def _recalled(run: Path, kind: type[Experience], **arguments: Any) -> Experience:
@@ -102,8 +117,10 @@ def _put(config: dict[str, Any], key: str, value: Any) -> None:
 
 
 @contextmanager
-def loaded_agent(run: str, device: str, samples: int | None = None) -> Iterator[tuple[ActingModel, EnvironmentProcess]]:
-    """Load a run's agent on a device, with its environment, which is closed at the end.
+def loaded_agent(
+    run: str, device: str, samples: int | None = None
+) -> Iterator[tuple[ActingModel, EnvironmentProcess, str]]:
+    """Load a run's agent on a device, with its environment, which is closed at the end, and its checkpoint's SHA-256.
 
     Args:
         run: folder.
@@ -113,16 +130,30 @@ def loaded_agent(run: str, device: str, samples: int | None = None) -> Iterator[
     Raises:
         ForbesError: where the run is not an agent's.
     """
-    module, data = load_run(run)
+    module, data, _, checkpoint = open_run(run)
     if not isinstance(module, ActingModel) or not isinstance(data.source, Experience):
         kind = type(module).__name__
         raise ForbesError(f"{run}: not the run of an agent, but of a {kind}. Name an agent's, or measure it by itself")
     module.to(device)
     module.acting_samples = samples or module.acting_samples
     try:
-        yield module, data.source.environment
+        yield module, data.source.environment, checkpoint
     finally:
         data.source.close()
+
+
+def weights_of(content: Any, name: str) -> dict[str, Tensor]:
+    """Return the weights in a checkpoint.
+
+    Raises:
+        ForbesError: where it is not the checkpoint of a training.
+    """
+    state = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(state, dict) or not all(isinstance(values, Tensor) for values in state.values()):
+        raise ForbesError(f"{name}: has no state_dict of tensors, expected that of a training. Take another one")
+    if not isinstance(content.get("global_step"), int):
+        raise ForbesError(f"{name}: does not say its global_step, expected the checkpoint of a training")
+    return state
 
 
 def check_weights(model: nn.Module, state: Mapping[str, Tensor], name: str) -> None:

@@ -21,11 +21,12 @@ from lightning.pytorch.cli import LightningArgumentParser, SaveConfigCallback
 import forbes
 from forbes.errors import ForbesError
 from forbes.files import replace_file
+from forbes.reading import read_json
 from forbes.training.configuration import allowed_modules
 from forbes.training.run_folder import RunFolder
 from forbes.training.stop import StopOnSignal
 
-__all__ = ["RecordRun", "command_line", "commit"]
+__all__ = ["RecordRun", "command_line", "commit", "read_provenance"]
 
 PACKAGES = ("torch", "lightning", "jsonargparse", "numpy", "dm-control", "mujoco", "gymnasium")
 """What may change the numbers of a run; the last three are optional."""
@@ -60,7 +61,7 @@ class RecordRun(SaveConfigCallback):
         """Write both files before the training starts."""
         replace_file(self.run.config, self.parser.dump(self.config, skip_unset=False).encode())
         path = self.run.provenance
-        self._entries: list[dict[str, Any]] = json.loads(path.read_text()) if path.is_file() else []
+        self._entries = read_provenance(path) if path.is_file() else []
         seed = {"seed": self.config["seed_everything"]}
         self._entries.append(_describe(self.arguments) | seed | _describe_data(trainer))
         self._write()
@@ -74,7 +75,7 @@ class RecordRun(SaveConfigCallback):
         if self.stop.received is not None:
             self._end(self.stop.exit_status)
         else:
-            self._end(2 if isinstance(exception, ForbesError) else 1)
+            self._end(exception.exit_status if isinstance(exception, ForbesError) else 1)
 
     def _end(self, exit_status: int) -> None:
         if self.already_saved:
@@ -84,6 +85,19 @@ class RecordRun(SaveConfigCallback):
 
     def _write(self) -> None:
         replace_file(self.run.provenance, json.dumps(self._entries, indent=2).encode() + b"\n")
+
+
+def read_provenance(path: Path) -> list[dict[str, Any]]:
+    """Read provenance.json.
+
+    Raises:
+        ForbesError: where it is not a list of starts.
+    """
+    remedy = "Move it out of the run folder, and give the command again"
+    entries = read_json(path, remedy)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ForbesError(f"{path}: expected a list with an entry for each start. {remedy}")
+    return entries
 
 
 def _describe(arguments: Sequence[str]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """Run folders: everything that one training leaves, in one place that no two processes share."""
 
-import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,8 +10,9 @@ import pandas as pd
 
 from forbes.errors import ForbesError
 from forbes.files import locked, require_no_links
+from forbes.reading import is_number, read_yaml
 
-__all__ = ["RunFolder", "experiment_name", "read_metrics"]
+__all__ = ["RunFolder", "experiment_name", "read_config", "read_metrics"]
 
 
 class RunFolder:
@@ -23,7 +23,8 @@ class RunFolder:
         config.yaml        the whole configuration, defaults included
         provenance.json    what was run, when, by which versions, on what data: one entry for each start
         metrics.jsonl      one JSON object a line: {"update": n, "epoch": e, name: value, ...}
-        checkpoints/       last.ckpt
+        checkpoints/       last.ckpt, and previous.ckpt, which is read where the last one is damaged
+        failure.pt         after a divergence: weights, batch and seed of the update whose loss is not finite
         figures/
         evaluation.json    and evaluation.npz, what `forbes evaluate` has measured
         evaluation-best/   the same of another checkpoint, here checkpoints/best.ckpt
@@ -36,6 +37,8 @@ class RunFolder:
             instead of the last one.
     """
 
+    LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
+
     def __init__(self, path: Path | str) -> None:
         path = Path(path)
         chosen = path if path.suffix == ".ckpt" else None
@@ -43,7 +46,8 @@ class RunFolder:
         self.config = self.path / "config.yaml"
         self.provenance = self.path / "provenance.json"
         self.metrics = self.path / "metrics.jsonl"
-        last = self.path / "checkpoints" / "last.ckpt"
+        self.failure = self.path / "failure.pt"
+        last = self.path / "checkpoints" / self.LAST
         self.checkpoint = chosen or last
         self.results = self.path if self.checkpoint == last else self.path / f"evaluation-{self.checkpoint.stem}"
         self.figures = self.path / "figures"
@@ -86,10 +90,6 @@ class RunFolder:
         require_no_links(path for path in run.path.iterdir() if path.is_dir())
         return run
 
-    def checkpoint_sha256(self) -> str:
-        """Hash the checkpoint: it tells what was measured."""
-        return hashlib.sha256(self.checkpoint.read_bytes()).hexdigest()
-
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Keep every other process from training in this folder; the system frees it when the process dies."""
@@ -109,6 +109,25 @@ def experiment_name(configs: Sequence[str]) -> str:
     return parts[-1]
 
 
+def read_config(path: Path) -> dict[str, Any]:
+    """Read the config.yaml of a run.
+
+    Raises:
+        ForbesError: where it is not what `forbes fit` writes.
+    """
+    remedy = "Restore it, or name another run"
+    config = read_yaml(path, remedy)
+    if not isinstance(config, dict):
+        raise ForbesError(f"{path}: holds a {type(config).__name__}, expected sections model and data. {remedy}")
+    for name in ("model", "data"):
+        section = config.get(name)
+        if not isinstance(section, dict) or not isinstance(section.get("class_path"), str):
+            raise ForbesError(f"{path}: its section {name} has no class_path, expected the name of a class. {remedy}")
+        if not isinstance(section.setdefault("init_args", {}), dict):
+            raise ForbesError(f"{path}: {name}.init_args is no mapping, expected arguments by name. {remedy}")
+    return config
+
+
 def read_metrics(run: Path | str) -> pd.DataFrame:
     """Read a run's metrics: a row for each update, a column for each name, the last value where there are several.
 
@@ -121,15 +140,15 @@ def read_metrics(run: Path | str) -> pd.DataFrame:
     if not path.is_file():
         raise ForbesError(f"{path}: no such file. Name a run folder that `forbes fit` made")
     rows: dict[int, dict[str, Any]] = {}
-    lines = path.read_text().splitlines(keepends=True)
+    *lines, _ = path.read_bytes().split(b"\n")  # a kill cut the last line short; or it is being written
     for number, line in enumerate(lines, start=1):
-        if number == len(lines) and not line.endswith("\n"):
-            break  # a kill cut the last line short; or it is being written
         try:
             record = json.loads(line)
-            update = record.pop("update")
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ForbesError(f"{path}: line {number} is not a line of metrics. Repair or delete it") from error
+        except (ValueError, RecursionError):
+            record = None
+        if not _is_line_of_metrics(record):
+            raise ForbesError(f"{path}: line {number} is not a line of metrics. Repair or delete it")
+        update = record.pop("update")
         if record.pop("start", False):
             rows = {known: row for known, row in rows.items() if known <= update}
         else:
@@ -137,3 +156,10 @@ def read_metrics(run: Path | str) -> pd.DataFrame:
     table = pd.DataFrame.from_dict(dict(sorted(rows.items())), orient="index")
     table.index.name = "update"
     return table
+
+
+def _is_line_of_metrics(record: Any) -> bool:
+    """Tell whether this is what `JsonLinesLogger` writes: an update, and numbers."""
+    if not isinstance(record, dict) or type(record.get("update")) is not int:
+        return False
+    return all(is_number(value) for name, value in record.items() if name != "start")

@@ -19,6 +19,7 @@ from forbes.models.likelihoods import Likelihood, Normal, VectorNormal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
+from forbes.training.divergence import hold_unless_finite
 
 __all__ = ["Group", "Objective", "WorldModel", "batches_before", "follow_rates", "require_at_least", "together"]
 
@@ -208,10 +209,11 @@ class WorldModel(LightningModule):
     def configure_gradient_clipping(
         self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """Clip each group to `clip_norm` and log the norm before."""
+        """Clip each group to `clip_norm` and log the norm before; make no step where a norm is not finite."""
         for group in self.groups():
             norm = torch.nn.utils.clip_grad_norm_(group.parameters, self.clip_norm, foreach=True)
             self.log(f"train/gradient_norm_{group.name}", norm)
+            hold_unless_finite(optimizer, norm, self.global_step)
 
     def measures(self, terms: ElboTerms) -> dict[str, Tensor]:
         """Give means in nats per sequence, auxiliary losses per step: the bound without free nats, and its parts."""

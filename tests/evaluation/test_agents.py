@@ -48,6 +48,15 @@ def test_the_return_is_what_the_agent_earns_without_exploration(run, capsys):
     assert "ImaginationActorCritic" in capsys.readouterr().out
 
 
+def test_a_record_names_the_agent_that_has_played(run, tmp_path, overwritten):
+    shutil.copytree(run, copy := tmp_path / "copy")
+
+    assert forbes("evaluate", copy, "--episodes", 3) == 0
+
+    (read,) = overwritten.values()
+    assert {entry["checkpoint"] for entry in read_record(copy).values()} == {read}
+
+
 def test_every_agent_plays_the_same_episodes(run, tmp_path, capsys):
     shutil.copytree(run, twin := tmp_path / "twin")
 

@@ -70,10 +70,17 @@ def error_of(capsys, *arguments):
     return line
 
 
+def test_a_record_names_the_checkpoint_that_was_measured(run, overwritten):
+    assert beliefs(run, "--sequences", "12") == 0
+
+    (read,) = overwritten.values()
+    assert {entry["checkpoint"] for entry in record(run).values()} == {read}
+
+
 def test_prints_and_records_the_errors_of_the_run_beside_the_best_gaussian(run, capsys):
     assert beliefs(run, "--sequences", "12") == 0
 
-    module, data = load_known_belief(run)
+    module, data, *_ = load_known_belief(run)
     batch = data.sequences("test", torch.arange(12))
     exact = module.process.exact_filter(batch.observation, batch.action).belief
     belief = module.double().model.belief(batch.observation.double(), batch.action.double())

@@ -107,6 +107,14 @@ def test_records_where_the_numbers_come_from(runs):
     assert entry["data"]["sha256"] == record(runs[1])[NAME]["data"]["sha256"]
 
 
+def test_a_record_names_the_checkpoint_that_was_measured(runs, overwritten):
+    assert evaluate(*runs) == 0
+
+    for run in map(RunFolder, runs):
+        entries = json.loads((run.path / "evaluation.json").read_text())
+        assert {entry["checkpoint"] for entry in entries.values()} == {overwritten[str(run.checkpoint)]}
+
+
 def test_every_score_is_measured_by_default_and_named_with_its_numbers(runs, capsys):
     numbers = ["--samples", "2", "--particles", "3", "--futures", "4", "--context", "2", "--digits", "5"]
     assert main(["evaluate", *runs, *numbers]) == 0

@@ -1,6 +1,8 @@
 """`forbes completions`, as a user calls it, and its pictures."""
 
+import hashlib
 import json
+import shutil
 from pathlib import Path
 
 import matplotlib as mpl
@@ -47,11 +49,21 @@ def test_the_record_says_what_was_measured_and_how(completed, runs):
     assert record["command"].startswith(f"forbes completions {runs[0]} {runs[1]} --digits 12")
     assert record["seed"] == 0
     assert record["classifiers"] == digit_classifiers.CLASSIFIERS_SHA256
-    assert [run["checkpoint"] for run in record["runs"]] == [RunFolder(run).checkpoint_sha256() for run in runs]
+    assert [run["checkpoint"] for run in record["runs"]] == [
+        hashlib.sha256(RunFolder(run).checkpoint.read_bytes()).hexdigest() for run in runs
+    ]
     assert {"commit", "data"} <= record.keys()
     assert len(pd.read_csv(completed / "completions.csv")) == len(record["scores"])
     curve = next(one for one in record["curves"] if one["row"] == "RSSM" and one["c"] == 3)
     assert len(curve["best"]) == len(curve["average"]) == 4
+
+
+def test_the_record_names_the_checkpoints_that_were_measured(runs, tmp_path, overwritten):
+    copies = [str(shutil.copytree(run, tmp_path / str(number))) for number, run in enumerate(runs)]
+    assert main(["completions", *copies, *NUMBERS, "-o", str(tmp_path)]) == 0
+
+    found = json.loads((tmp_path / "completions.json").read_text())["runs"]
+    assert [run["checkpoint"] for run in found] == [overwritten[str(RunFolder(run).checkpoint)] for run in copies]
 
 
 def test_differences_are_paired_and_their_mean_is_that_of_the_scores(completed, runs):

@@ -24,7 +24,8 @@ def runs(tmp_path):
         lines = [{"update": step, "env_steps": step, "return/acting": value} for step, value in returns]
         (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         source = f"{{class_path: Experience, init_args: {{task: {task}}}}}"
-        (folder / "config.yaml").write_text(f"data: {{init_args: {{source: {source}}}}}\n")
+        data = f"{{class_path: SequenceDataModule, init_args: {{source: {source}}}}}"
+        (folder / "config.yaml").write_text(f"model: {{class_path: ImaginationActorCritic}}\ndata: {data}\n")
         return str(folder)
 
     return make

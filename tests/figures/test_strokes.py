@@ -80,9 +80,14 @@ def test_families_of_one_name_are_told_apart_by_what_their_folders_do_not_share(
 
 def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo(runs, tmp_path):
     copies = [str(shutil.copytree(run, tmp_path / str(number))) for number, run in enumerate(runs)]
-    for copy, mean in zip(copies, (-90.0, -100.0), strict=False):
-        metric = {"test/elbo[bernoulli,S=16]": {"mean": mean, "standard_error": 1.0}}
-        (tmp_path / copy / "evaluation.json").write_text(json.dumps(metric))
+    first, second, rssm = load_runs(copies)
+    for run, mean, checkpoint in [
+        (first, -90.0, first.checkpoint),
+        (second, -100.0, second.checkpoint),
+        (rssm, -80.0, "of an earlier epoch"),
+    ]:
+        metric = {"test/elbo[bernoulli,S=16]": {"mean": mean, "standard_error": 1.0, "checkpoint": checkpoint}}
+        (tmp_path / run.path / "evaluation.json").write_text(json.dumps(metric))
 
     (axes,) = elbo_against_updates(group(load_runs(copies)), {}).axes
 

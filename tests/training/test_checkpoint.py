@@ -2,6 +2,8 @@
 
 import errno
 import os
+import random
+import re
 import subprocess
 import sys
 import zipfile
@@ -53,7 +55,7 @@ def test_a_kill_at_any_step_of_saving_leaves_the_old_checkpoint_whole(path, monk
     torch.testing.assert_close(read_checkpoint(path), OLD)
     AtomicCheckpointIO().save_checkpoint(NEW, path)  # what the kill has left behind is in nobody's way
     torch.testing.assert_close(read_checkpoint(path), NEW)
-    assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
+    assert {file.name for file in path.parent.iterdir()} == {"last.ckpt", "previous.ckpt"}
 
 
 def test_a_real_kill_leaves_a_whole_checkpoint(tmp_path):
@@ -108,6 +110,62 @@ def test_a_flipped_bit_in_a_tensor_is_refused(path):
 
     with pytest.raises(ForbesError, match=r"last\.ckpt: the checkpoint is damaged"):
         read_checkpoint(path)
+
+
+def directory_entries(content):
+    """Where the entries of a zip file's directory begin."""
+    return [match.start() for match in re.finditer(b"PK\x01\x02", content)]
+
+
+def test_a_flipped_bit_anywhere_in_the_file_never_gives_other_numbers(path):
+    """Bit 4 of byte 38 of a directory entry makes it a folder, of which torch reads zeros."""
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {"weight": torch.arange(1.0, 9.0)}}, path)
+    path.with_name("previous.ckpt").unlink()
+    content, expected = path.read_bytes(), read_checkpoint(path)
+    bits = [8 * (entry + byte) + bit for entry in directory_entries(content) for byte in (38, 39) for bit in range(8)]
+    for place in bits + random.Random(0).sample(range(8 * len(content)), 300):
+        broken = bytearray(content)
+        broken[place // 8] ^= 1 << place % 8
+        path.write_bytes(broken)
+        try:
+            torch.testing.assert_close(read_checkpoint(path), expected, rtol=0, atol=0)
+        except ForbesError:
+            continue
+
+
+def test_a_folder_in_a_checkpoint_without_a_seal_is_refused(path):
+    torch.save(NEW, path)
+    content = bytearray(path.read_bytes())
+    for entry in directory_entries(content):
+        content[entry + 38] ^= 0x10
+    path.write_bytes(content)
+
+    with pytest.raises(ForbesError, match=r"last\.ckpt: the checkpoint is damaged"):
+        read_checkpoint(path)
+
+
+def test_a_damaged_checkpoint_falls_back_to_the_one_before_and_says_so(path, capsys):
+    AtomicCheckpointIO().save_checkpoint(NEW, path)
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+
+    torch.testing.assert_close(read_checkpoint(path), OLD)
+    assert f"WARNING: {path}: truncated or damaged" in (said := capsys.readouterr().err)
+    assert said.endswith(f"reading {path.with_name('previous.ckpt')}\n")
+
+    AtomicCheckpointIO().save_checkpoint(NEW, path)  # which does not put the damaged one in the place of the whole
+    torch.testing.assert_close(read_checkpoint(path), NEW)
+    torch.testing.assert_close(read_checkpoint(path.with_name("previous.ckpt")), OLD)
+
+
+def test_the_checkpoint_before_is_kept_where_there_are_no_hard_links(path, monkeypatch):
+    def refused(*_):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
+    AtomicCheckpointIO().save_checkpoint(NEW, path)
+
+    torch.testing.assert_close(read_checkpoint(path), NEW)
+    torch.testing.assert_close(read_checkpoint(path.with_name("previous.ckpt")), OLD)
 
 
 def test_a_checkpoint_that_would_run_code_is_refused(path, monkeypatch):

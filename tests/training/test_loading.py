@@ -67,6 +67,14 @@ def test_a_checkpoint_that_lacks_a_tensor_is_one_sentence(run):
         load_run(run.path)
 
 
+@pytest.mark.parametrize("content", [{}, {"state_dict": 3}, {"state_dict": {}}, [1], {"state_dict": {"a": "b"}}])
+def test_a_checkpoint_that_is_no_trainings_is_one_sentence(run, content):
+    AtomicCheckpointIO().save_checkpoint(content, run.checkpoint)
+
+    with pytest.raises(ForbesError, match=r"last\.ckpt: (has no state_dict of tensors|does not say its global_step)"):
+        load_run(run.path)
+
+
 def test_a_checkpoint_of_another_size_is_one_sentence_with_both_shapes(run):
     configure(run, lambda config: config["model"]["init_args"].update(hidden_dim=5))
 

@@ -40,6 +40,16 @@ def test_two_epochs_and_two_more_are_four_epochs(straight, tiny_run, tmp_path):
     assert_same_run(run, straight)
 
 
+def test_a_run_whose_checkpoint_is_damaged_goes_on_from_the_one_before(straight, tiny_run, tmp_path, capsys):
+    run = RunFolder(shutil.copytree(tiny_run, tmp_path / "run"))
+    run.checkpoint.write_bytes(run.checkpoint.read_bytes()[:-100])
+
+    assert main(["fit", "--resume", str(run), *FOUR_EPOCHS]) == 0
+
+    assert f"reading {run.checkpoint.with_name('previous.ckpt')}" in capsys.readouterr().err
+    assert_same_run(run.path, straight)
+
+
 @pytest.mark.parametrize(
     "limits",
     [

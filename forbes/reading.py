@@ -1,0 +1,75 @@
+"""Files that may be damaged: what they hold, or one sentence that says which file, what is wrong and what to do."""
+
+import io
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from forbes.errors import ForbesError
+
+__all__ = ["is_number", "read_json", "read_npz", "read_yaml", "readable", "shortened"]
+
+_REASON = 120  # characters of what a parser says
+
+
+@contextmanager
+def readable(path: Path | str, kind: str, remedy: str, raises: type[ForbesError] = ForbesError) -> Iterator[None]:
+    """Turn whatever a parser raises on damaged bytes into one sentence.
+
+    Parsers raise errors of any class on bytes they were not made for. So all are caught, and nothing but parsing
+    belongs inside.
+
+    Args:
+        path: of the file.
+        kind: what it should be, e.g. "JSON".
+        remedy: what to do about it, the error's last sentence.
+        raises: the class of the error.
+
+    Raises:
+        ForbesError: for any error inside.
+    """
+    try:
+        yield
+    except ForbesError:
+        raise
+    except Exception as error:
+        reason = shortened(str(error), _REASON) or type(error).__name__
+        raise raises(f"{path}: truncated or not {kind} ({reason}). {remedy}") from error
+
+
+def shortened(text: str, length: int) -> str:
+    """Return a text as one line of at most `length` characters."""
+    line = " ".join(text.split())
+    return line if len(line) <= length else line[: length - 1] + "…"
+
+
+def is_number(value: object) -> bool:
+    """Tell whether a value of a JSON file is a number."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def read_json(path: Path, remedy: str) -> Any:
+    """Read a JSON file."""
+    content = path.read_bytes()
+    with readable(path, "JSON", remedy):
+        return json.loads(content)
+
+
+def read_yaml(path: Path, remedy: str) -> Any:
+    """Read a YAML file of plain values."""
+    content = path.read_bytes()
+    with readable(path, "YAML", remedy):
+        return yaml.safe_load(content)
+
+
+def read_npz(path: Path, remedy: str) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an `.npz` file."""
+    content = path.read_bytes()
+    with readable(path, "an .npz file", remedy), np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return {str(name): arrays[name] for name in arrays}
