@@ -47,7 +47,7 @@ class TrainedRun(NamedTuple):
         kind = _kind(self.model)
         name = _FAMILIES.get(kind, kind.__name__)
         for part in reversed(Path(self.path).resolve().parts):
-            if match := re.fullmatch(f"{name}((?:_[a-z]+)+)", part, re.IGNORECASE):
+            if match := re.fullmatch(rf"{name}((?:_[a-z]+)+)(?:-\d+)?", part, re.IGNORECASE):
                 return name + match[1].replace("_", " ")
         return name
 

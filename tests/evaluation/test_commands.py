@@ -409,3 +409,11 @@ def test_wrong_arguments_are_named(runs, tmp_path, capsys):
     assert "no such run folder" in error_of(capsys, str(tmp_path / "nowhere"))
     (RunFolder(runs[0]).path / "evaluation.json").write_text("{")
     assert "not JSON" in error_of(capsys, runs[0])
+
+
+@pytest.mark.parametrize(
+    ("path", "family"),
+    [("runs/compare/rssm_wide-0", "RSSM wide"), ("runs/rssm_wide/7-0", "RSSM wide"), ("r-1", "RSSM")],
+)
+def test_the_folder_of_a_run_adds_to_its_family(runs, path, family):
+    assert load_runs(runs[1:])[0]._replace(path=path).family == family
