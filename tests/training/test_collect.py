@@ -217,7 +217,7 @@ def test_a_disk_that_is_full_ends_the_training_and_loses_nothing(run, tmp_path, 
 
 
 def test_an_agent_keeps_as_many_episodes_as_its_capacity_holds_and_counts_all(run, tmp_path, monkeypatch):
-    """Two of the parrot's, of 8 steps, and the two before, for both checkpoints; killed at the end, it goes on the same."""
+    """Two of the parrot's, of 8 steps, and the two before for both checkpoints; killed late, it goes on the same."""
     fit_it = ("--config", write_config(tmp_path), "--data.source.capacity", 16, "--run_dir")
 
     def kill(self, loss):
