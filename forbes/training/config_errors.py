@@ -168,7 +168,7 @@ def building(where: str) -> Iterator[None]:
     """
     try:
         yield
-    except argparse.ArgumentError:
+    except (argparse.ArgumentError, OSError):  # said elsewhere
         raise
     except Exception as error:
         if inner := raised_inside(error):

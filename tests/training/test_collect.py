@@ -242,7 +242,7 @@ def test_a_disk_that_is_full_ends_the_training_and_loses_nothing(run, tmp_path, 
 
 
 def test_an_agent_keeps_as_many_episodes_as_its_capacity_holds_and_counts_all(run, tmp_path, monkeypatch):
-    """Two of the parrot's, of 8 steps, and the one before each epoch; killed in the last one, it goes on the same."""
+    """Two of the parrot's, of 8 steps, and the two before for both checkpoints; killed late, it goes on the same."""
     fit_it = ("--config", write_config(tmp_path), "--data.source.capacity", 16, "--run_dir")
 
     def kill(self, loss):
@@ -258,7 +258,7 @@ def test_an_agent_keeps_as_many_episodes_as_its_capacity_holds_and_counts_all(ru
 
     for folder in (tmp_path / "whole", tmp_path / "cut"):
         kept = sorted(path.name for path in (folder / "episodes").glob("*.npz"))
-        assert kept == ["000001.npz", "000002.npz", "000003.npz"]
+        assert kept == ["000000.npz", "000001.npz", "000002.npz", "000003.npz"]
     metrics = read_metrics(tmp_path / "whole")
     assert metrics["env_steps"].dropna().tolist() == read_metrics(run)["env_steps"].dropna().tolist()
     pd.testing.assert_frame_equal(read_metrics(tmp_path / "cut"), metrics, check_exact=True)
