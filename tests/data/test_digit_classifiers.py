@@ -86,7 +86,7 @@ def test_other_weights_and_a_missing_file_are_refused(tmp_path, monkeypatch):
 
 
 def test_what_a_classifier_sees_is_the_last_frame_and_the_mean_of_all():
-    source = Strokes()
+    source = Strokes(frames="whole")
     index, time = torch.arange(20), 12
     frames = source.decode(source.gather("test", index, time)).observation.float()
 
