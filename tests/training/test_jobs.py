@@ -72,7 +72,8 @@ time.sleep(0.3)
 pathlib.Path(sys.argv[1]).write_text(str(len(seen)))
 """
     parent = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would begin by ignoring it
 from forbes.training.jobs import Job, run_jobs
 run_jobs([Job(name, [sys.executable, "-c", sys.argv[1], sys.argv[2] + name]) for name in "abc"], 2)
 """
