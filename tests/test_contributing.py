@@ -126,5 +126,5 @@ def test_a_figure_copied_from_its_recipe_is_saved_in_both_formats(copy_of):
     family = Family("FORBES", BLUE, random_model("gaussian"), [pd.Series({1: -9.0, 2: -8.0})], [])
 
     for kind in ("png", "pdf"):
-        save_figure(draw([family]), Path(f"figure.{kind}"))
+        save_figure(draw([family], {}), Path(f"figure.{kind}"))
         assert Path(f"figure.{kind}").stat().st_size > 0

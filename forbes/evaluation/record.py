@@ -20,7 +20,7 @@ from torch import Tensor
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.scoring import Scores
-from forbes.files import replace_file
+from forbes.files import no_link, replace_file
 from forbes.reading import is_number, read_json, read_npz, shortened
 from forbes.training.run_folder import RunFolder
 
@@ -141,7 +141,7 @@ def write_record(run: str | Path, entries: dict[str, dict[str, Any]], totals: di
     """
     folder = RunFolder(run).results
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".evaluation.lock").open("a") as file:
+    with open(folder / ".evaluation.lock", "a", opener=no_link) as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
         record = read_record(run) | entries
         arrays = read_arrays(run) | {name: values.numpy() for name, values in totals.items()}

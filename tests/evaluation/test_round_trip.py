@@ -80,6 +80,6 @@ def test_evaluate_records_the_round_trip_of_a_flow(tiny_run, tmp_path, capsys):
     assert main(["evaluate", str(run), "--scores", "elbo", "--samples", "2"]) == 0
 
     entry = json.loads((run / "evaluation.json").read_text())["test/round_trip"]
-    assert {*entry} == {"prior", "posterior", "sequences", "seed"}
+    assert {*entry} == {"prior", "posterior", "sequences", "seed", "checkpoint"}
     assert entry["posterior"]["log_prob"] < LIMIT
     assert "posterior flow, round trip" in capsys.readouterr().err

@@ -245,7 +245,7 @@ def test_a_curve_without_any_return_yet_is_empty():
         ("ImaginedFutures, init_args: {context: 9}", "ImaginedFutures: context is 9, expected less than the length 5"),
         ("EpisodeVideo, init_args: {every: 0}", "EpisodeVideo: every is 0, expected at least 1"),
         ("ReturnCurve, init_args: {reference: absent.json}", "absent.json: no such file of curves"),
-        ("ReturnCurve, init_args: {reference: empty.json}", "empty.json: not a file of curves"),
+        ("ReturnCurve, init_args: {reference: empty.json}", "empty.json: truncated or not JSON"),
         ("ReturnCurve, init_args: {reference: other.json}", "other.json: has no curve of Slide, but of dmc_walk"),
     ],
 )
