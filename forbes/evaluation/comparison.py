@@ -19,6 +19,7 @@ from forbes.evaluation.degradation import at_horizons, degradation
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.measured import SCORES, score_of
 from forbes.evaluation.record import read_arrays, read_record
+from forbes.evaluation.references import lowest_above
 
 __all__ = ["Comparison", "Family", "compare", "markdown"]
 
@@ -186,8 +187,8 @@ def markdown(comparison: Comparison, families: Sequence[Family]) -> str:
 
 def _below(values: Sequence[float], references: Mapping[str, float]) -> str:
     """Name the lowest reference above the mean of some values."""
-    above = [(mean, name) for name, mean in references.items() if mean > statistics.fmean(values)]
-    return f" < {min(above)[1]}" if above else ""
+    name = lowest_above(statistics.fmean(values), references)
+    return f" < {name}" if name else ""
 
 
 def _difference(differences: pd.DataFrame, of: tuple[str, str, int]) -> str:

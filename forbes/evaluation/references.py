@@ -8,6 +8,8 @@ pictures under the model's own standard deviation: the frame before, and the mea
 where :math:`o_0 = \bar o`. A model below them has learned less than that nothing moves.
 """
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -15,7 +17,7 @@ from forbes.data import SequenceDataModule, Split, Strokes
 from forbes.evaluation.ngram import fit_ngrams
 from forbes.models import Likelihood, Normal
 
-__all__ = ["references"]
+__all__ = ["lowest_above", "reference_means", "references"]
 
 _EXAMPLES, _ROWS = 500, 50
 """Training sequences whose mean frame is taken, and how many are decoded at a time."""
@@ -31,6 +33,18 @@ def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, c
             torch.manual_seed(0)  # of the noise below the bits of coarse pixels
             return _still_pictures(data, likelihood, split, count)
     return {}
+
+
+def reference_means(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, float]:
+    """Return by name the mean of log p in nats per sequence, over the first `count` sequences; none for no sequence."""
+    found = references(data, likelihood, split, count) if count else {}
+    return {name: values.sum(1).mean().item() for name, values in found.items()}
+
+
+def lowest_above(score: float, means: Mapping[str, float]) -> str | None:
+    """Return the name of the lowest reference above a score; None where it is above all or there is none."""
+    above = [(mean, name) for name, mean in means.items() if mean > score]
+    return min(above)[1] if above else None
 
 
 @torch.no_grad()

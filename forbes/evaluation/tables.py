@@ -13,6 +13,7 @@ from rich.table import Table
 from forbes.evaluation.degradation import at_horizons, degradation
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.measured import Measured, Pair
+from forbes.evaluation.references import lowest_above
 
 __all__ = ["beaten_by", "print_degradation", "print_pairs", "print_references", "print_runs"]
 
@@ -51,8 +52,7 @@ def print_references(measured: Sequence[Measured]) -> None:
 
 def beaten_by(entry: Mapping[str, Any]) -> str | None:
     """Return the lowest reference above an entry of `evaluation.json`; None where it is above all or has none."""
-    above = [(each["mean"], name) for name, each in entry.get("references", {}).items() if each["mean"] > entry["mean"]]
-    return min(above)[1] if above else None
+    return lowest_above(entry["mean"], {name: each["mean"] for name, each in entry.get("references", {}).items()})
 
 
 def print_pairs(pairs: Sequence[Pair]) -> None:

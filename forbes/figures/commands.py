@@ -14,7 +14,7 @@ from forbes.data import Strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import whole_sequences
 from forbes.evaluation.record import read_record
-from forbes.evaluation.references import references
+from forbes.evaluation.references import reference_means
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
 from forbes.figures.returns import returns_against_env_steps
 from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
@@ -54,8 +54,7 @@ def _strokes(args: argparse.Namespace) -> None:
         figure = predictions(families, data.source, batch, time, args.context, args.samples, args.mean)
         _save(figure, args.output, f"predictions-t{time}")
     count = min(data.validation_sequences, data.source.size("validation"))
-    found = references(data, runs[0].model.likelihood, "validation", count) if count else {}
-    means = {name: values.sum(1).mean().item() for name, values in found.items()}
+    means = reference_means(data, runs[0].model.likelihood, "validation", count)
     _save(elbo_against_updates(families, means), args.output, "elbo")
 
 

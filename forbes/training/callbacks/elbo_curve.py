@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forbes.data import SequenceDataModule
-from forbes.evaluation.references import references
+from forbes.evaluation.references import reference_means
 from forbes.figures.style import BLACK, BLUE, GREY, PAGE, draw_references, paper_style, show_settled
 from forbes.training.callbacks.picture import PictureCallback, to_device
 from forbes.training.run_folder import read_metrics
@@ -58,8 +58,7 @@ class ElboCurve(PictureCallback):
     def _references(self, module: WorldModel, data: SequenceDataModule) -> dict[str, float]:
         """Return the means of the references over the sequences of a validation."""
         count = min(data.validation_sequences, data.source.size("validation"))
-        found = references(data, module.model.likelihood, "validation", count)
-        return {name: values.sum(1).mean().item() for name, values in found.items()}
+        return reference_means(data, module.model.likelihood, "validation", count)
 
     def _kl_per_step(self, module: WorldModel, data: SequenceDataModule) -> tuple[Tensor, Tensor]:
         """Average the KL over sequences, each step on its own: mean and standard error, each `(T,)`."""
