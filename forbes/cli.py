@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from forbes import __version__
-from forbes.errors import ForbesError
+from forbes.errors import FULL, ForbesError, unwritable
 from forbes.parsers.fit import DESCRIPTION, help_page
 
 __all__ = ["main"]
@@ -157,7 +157,9 @@ def _help() -> str:
 
 
 def _sentence(error: Exception) -> str:
-    """Say a missing file and the like as shortly as our own errors."""
+    """Say a missing file, a full disk and the like as shortly as our own errors."""
+    if isinstance(error, OSError) and error.errno in FULL:
+        return str(unwritable(error.filename or "the output", error))
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {(error.strerror or type(error).__name__).lower()}"
     return str(error)

@@ -1,6 +1,16 @@
 """The error a user can mend: one sentence that says what, where and what to do."""
 
-__all__ = ["ForbesError"]
+import errno
+from pathlib import Path
+
+__all__ = ["FULL", "ForbesError", "unwritable"]
+
+FULL = {
+    errno.ENOSPC: "Make room, or choose another place",
+    errno.EDQUOT: "Make room in your quota, or choose another place",
+    errno.EFBIG: "Allow larger files (ulimit -f unlimited), or choose another place",
+}
+"""What to do where the system stores no more, by its number for the error."""
 
 
 class ForbesError(Exception):
@@ -11,3 +21,9 @@ class ForbesError(Exception):
     """
 
     exit_status = 2
+
+
+def unwritable(path: Path | str, error: OSError) -> ForbesError:
+    """Return the sentence for a file that cannot be written: which, why and what to do."""
+    remedy = FULL.get(error.errno or 0, "Choose another place")
+    return ForbesError(f"{path}: cannot be written ({error.strerror}). {remedy}")

@@ -1,6 +1,7 @@
 """Files that no reader sees half of, folders that no two processes write to, arrays that are stored alike anywhere.
 
-A folder may come from anywhere. What is written to it is written there, and not to where a symbolic link in it leads.
+Where a file cannot be written, as on a full disk, one sentence names it. A folder may come from anywhere. What is
+written to it is written there, and not to where a symbolic link in it leads.
 """
 
 import errno
@@ -18,9 +19,23 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, unwritable
 
-__all__ = ["fsync_folder", "locked", "no_link", "npz_bytes", "replace_file", "require_no_links"]
+__all__ = ["append_whole", "drop_half_line", "fsync_folder", "locked", "no_link", "npz_bytes", "replace_file"]
+__all__ += ["require_no_links", "writing"]
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the system says while this file is written into one sentence.
+
+    Raises:
+        ForbesError: for an OSError inside.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(path, error) from error
 
 
 def replace_file(
@@ -32,19 +47,55 @@ def replace_file(
         path: of the file; a symbolic link is replaced, not followed.
         content: of the new file.
         verify: raises where the new file, which it is given, is not to replace the old one.
+
+    Raises:
+        ForbesError: where it cannot be written; the old file, if there is one, is untouched.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")  # nobody can guess it and put a link there
-    try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        verify(temporary)
-        temporary.replace(path)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            verify(temporary)
+            temporary.replace(path)
+            fsync_folder(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def append_whole(path: Path, content: bytes, sync: bool = False) -> None:
+    """Append to a file, all of it or nothing.
+
+    Args:
+        path: of the file; it need not exist.
+        content: to append.
+        sync: make it survive a power loss, too.
+
+    Raises:
+        ForbesError: where it cannot be written, or is a symbolic link.
+    """
+    with writing(path), open(path, "ab", buffering=0, opener=no_link) as file:
+        size = file.tell()
+        try:
+            while content:
+                content = content[file.write(content) :]
+            if sync:
+                os.fsync(file.fileno())
+        except OSError:
+            file.truncate(size)
+            raise
+    if sync and size == 0:
         fsync_folder(path.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
+
+
+def drop_half_line(path: Path) -> None:
+    """Remove what a kill has left of a line at the end of a file, if there is one."""
+    if path.is_file():
+        with open(path, "rb+", opener=no_link) as file:
+            file.truncate(file.read().rfind(b"\n") + 1)
 
 
 def no_link(path: str, flags: int) -> int:
@@ -102,7 +153,8 @@ def locked(folder: Path, complaint: str) -> Iterator[None]:
         except BlockingIOError as error:
             file.seek(0)
             raise ForbesError(f"{folder}: {file.read()} {complaint}") from error
-        _replace_content(file, f"process {os.getpid()} on {platform.node()}")
+        with writing(folder / ".lock"):
+            _replace_content(file, f"process {os.getpid()} on {platform.node()}")
         yield
 
 

@@ -34,9 +34,11 @@ ENTRY = {
 }
 EPISODE = {
     **{"number": 0, "steps": 3, "frames": 6, "total_reward": 1.5, "terminated": False, "seed": 7, "policy": "random"},
-    **{"environment": {"task": "Parrot", "discrete": False}, "size": 100, "sha256": "0" * 64},
+    **{"environment": {"task": "Parrot", "observation_shape": [2], "action_dim": 1, "discrete": False}},
+    **{"size": 100, "sha256": "0" * 64},
 }
 INDEX = [EPISODE, EPISODE | {"number": 1}, {"quarantined": 0}, {"set_aside_from": 1}, {"forgotten_before": 1}]
+INDEX += [{"compacted": {"watermark": 2, "first": 1, "forgotten_steps": 3, "forgotten_frames": 6}}]
 TYPES = ["", "null", "[]", "3", '""', "true", '{"": null}', "[[1], 2]", "1e999", "NaN"]
 """What can stand in the place of a whole file or of a value."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
 from forbes.errors import ForbesError
-from forbes.files import no_link
+from forbes.files import append_whole
 
 __all__ = ["data_folder", "download", "git_blob_id"]
 
@@ -57,16 +57,21 @@ def _receive(response: http.client.HTTPResponse, part: Path, url: str, remedy: s
     resumed = response.status == http.HTTPStatus.PARTIAL_CONTENT
     announced = response.headers["Content-Length"]
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with open(part, "ab" if resumed else "wb", opener=no_link) as file, Progress(*columns) as progress:
-        total = file.tell() + int(announced) if announced else None
-        task = progress.add_task(url.rpartition("/")[2], total=total, completed=file.tell())
+    held = part.stat().st_size if resumed else 0
+    if not resumed:
+        part.unlink(missing_ok=True)
+    append_whole(part, b"")  # it is there, though nothing may come
+    with Progress(*columns) as progress:
+        total = held + int(announced) if announced else None
+        task = progress.add_task(url.rpartition("/")[2], total=total, completed=held)
         while chunk := response.read(_CHUNK):
-            file.write(chunk)
-            progress.update(task, completed=file.tell())
-            if file.tell() > _DOWNLOAD_LIMIT:
+            append_whole(part, chunk)
+            held += len(chunk)
+            progress.update(task, completed=held)
+            if held > _DOWNLOAD_LIMIT:
                 raise ForbesError(f"{url}: sends more than {_DOWNLOAD_LIMIT} bytes, expected a smaller file. {remedy}")
-        if total is not None and file.tell() < total:
-            raise ForbesError(f"{url}: interrupted after {file.tell()} of {total} bytes. Run it again to go on.")
+        if total is not None and held < total:
+            raise ForbesError(f"{url}: interrupted after {held} of {total} bytes. Run it again to go on.")
 
 
 def git_blob_id(path: Path) -> str:

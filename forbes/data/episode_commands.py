@@ -20,7 +20,8 @@ def info(path: Path, output: Path | None = None) -> None:
         path: folder of the store.
         output: picture to write, by default `frames.png` in the folder; only images of at most four channels are drawn.
     """
-    store = _opened(path)
+    store = EpisodeStore(path)
+    store.require_episodes()
     records = sorted(store.records.values(), key=lambda record: record.total_reward)
     for name, value in _facts(store, records):
         print(f"{name:<22}{value}")
@@ -66,7 +67,9 @@ def check(path: Path) -> int:
     Args:
         path: folder of the store.
     """
-    _opened(path)
+    store = EpisodeStore(path)
+    if not store.files():  # else a lost index can be rebuilt
+        store.require_episodes()
     with EpisodeWriter(path) as writer:
         count, damage = len(writer.records), writer.damage()
         for number, reason in damage.items():
@@ -74,13 +77,6 @@ def check(path: Path) -> int:
             print(f"{writer.file(number)}: damaged ({reason}), moved to {path / 'quarantine'}")
     print(f"{path}: {count} episodes read, {count - len(damage)} whole, {len(damage)} damaged")
     return int(bool(damage))
-
-
-def _opened(path: Path) -> EpisodeStore:
-    """Open a store that has episodes."""
-    store = EpisodeStore(path)
-    store.require_episodes()
-    return store
 
 
 def count_steps(records: list[EpisodeRecord]) -> str:

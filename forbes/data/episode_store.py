@@ -3,25 +3,25 @@
 ::
 
     DIR/
-      index.jsonl     one JSON object a line, appended and synced: an episode, or what became of some
+      index.jsonl     one JSON object a line, appended and synced: an episode, or what became of some (`EpisodeIndex`)
       000000.npz …    an episode each, written beside, synced and renamed before its line is appended
       set_aside/      episodes of a future that a resumed run has not lived, and whole files the index does not know
       quarantine/     damaged files
 
-A line is an `EpisodeRecord`, or one of ``{"set_aside_from": n}``, ``{"forgotten_before": n}``, ``{"quarantined": n}``.
-The watermark is the number that the next episode will have: a checkpoint that holds it says "up to here".
+Files with other names are left alone. The watermark is the number that the next episode will have: a checkpoint that
+holds it says "up to here".
 """
 
-import errno
 import hashlib
 import json
-import os
+import re
+import sys
 from collections.abc import Iterable
 from contextlib import ExitStack
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
+from forbes.data.episode_index import EpisodeIndex
 from forbes.data.episodes import (
     DamagedEpisodeError,
     Episode,
@@ -30,9 +30,10 @@ from forbes.data.episodes import (
     pack_episode,
     problem_of,
     problem_with,
+    read_record,
 )
 from forbes.errors import ForbesError
-from forbes.files import fsync_folder, locked, no_link, replace_file
+from forbes.files import drop_half_line, locked, replace_file
 
 __all__ = ["EpisodeStore", "EpisodeWriter", "first_held"]
 
@@ -52,70 +53,63 @@ class EpisodeStore:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self.index = self.path / "index.jsonl"
+        self.index = EpisodeIndex(self.path / "index.jsonl")
         self._verified: set[str] = set()
-        self._open = lru_cache(maxsize=_OPEN_FILES)(self._map)
-        self.refresh()
+        self._mapped: dict[tuple[int, str], Episode] = {}
 
-    def require_episodes(self) -> None:
-        """Raise a ForbesError where there are none."""
+    @property
+    def records(self) -> dict[int, EpisodeRecord]:
+        """The episodes by number, the oldest first."""
+        return self.index.records
+
+    @property
+    def watermark(self) -> int:
+        """The number that the next episode will have."""
+        return self.index.watermark
+
+    def require_folder(self) -> None:
+        """Raise a ForbesError where there is none."""
         if not self.path.is_dir():
             raise ForbesError(
                 f"{self.path}: no such folder. Name one that has episodes, or collect some: "
                 f"forbes data collect --task TASK -o {self.path}"
             )
-        if not self.records:
-            damaged = len([*self.path.glob("quarantine/*.npz")])
+
+    def require_episodes(self) -> None:
+        """Raise a ForbesError where there are none."""
+        self.require_folder()
+        if self.records:
+            return
+        if files := self.files():
             raise ForbesError(
-                f"{self.path}: there are no episodes{f' but {damaged} in quarantine' if damaged else ''}. "
-                f"Collect some: forbes data collect --task TASK -o {self.path}"
+                f"{self.index.path}: lost, but there are the files of {len(files)} episodes. Rebuild it from them: "
+                f"forbes data check {self.path}"
             )
+        damaged = len([*self.path.glob("quarantine/*.npz")])
+        raise ForbesError(
+            f"{self.path}: there are no episodes{f' but {damaged} in quarantine' if damaged else ''}. "
+            f"Collect some: forbes data collect --task TASK -o {self.path}"
+        )
 
     def refresh(self) -> None:
         """Read the index again: another process may have added to it."""
-        self.records: dict[int, EpisodeRecord] = {}
-        """By number, the oldest first."""
-        self.watermark = 0
-        self.first = 0
-        """Episodes before this number are forgotten."""
-        self.forgotten_steps, self.forgotten_frames = 0, 0
-        text = self.index.read_text(errors="replace") if self.index.is_file() else ""
-        for place, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):  # a kill may cut the last
-            try:
-                self._apply(json.loads(line))
-            except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-                raise ForbesError(
-                    f"{self.index}: line {place} is not a line of the index. Delete it; the episode's file stays"
-                ) from error
+        self.index.refresh()
+        self._close_maps()
 
-    def _apply(self, line: dict[str, Any]) -> None:
-        """Follow one line of the index."""
-        if "number" in line:
-            record = EpisodeRecord(**line)
-            record.require_types()
-            self.records[record.number] = record
-            self.watermark = record.number + 1
-            return
-        ((event, number),) = line.items()
-        if type(number) is not int:
-            raise TypeError(number)
-        if event == "quarantined":
-            self.records.pop(number, None)
-        elif event == "set_aside_from":
-            self.watermark = number
-            self.records = {n: record for n, record in self.records.items() if n < number}
-        elif event == "forgotten_before":
-            self.first = number
-            for forgotten in [n for n in self.records if n < number]:
-                record = self.records.pop(forgotten)
-                self.forgotten_steps += record.steps
-                self.forgotten_frames += record.frames
-        else:
-            raise ValueError(event)
+    def _close_maps(self) -> None:
+        """Let go of the files of episodes that are no longer here, which keep their room on the disk as long."""
+        here = {(number, record.sha256) for number, record in self.records.items()}
+        self._mapped = {key: episode for key, episode in self._mapped.items() if key in here}
 
     def file(self, number: int) -> Path:
         """Give the path of an episode."""
         return self.path / f"{number:06d}.npz"
+
+    def files(self) -> list[int]:
+        """List the numbers of the episodes whose files are in the folder, in order."""
+        names = (path.stem for path in self.path.glob("*.npz"))
+        numbers = {int(name) for name in names if re.fullmatch("[0-9]{6,}", name)}
+        return sorted(number for number in numbers if self.file(number).is_file())
 
     def episode(self, number: int) -> Episode:
         """Open an episode; the first time in this process, compare it with its hash.
@@ -123,18 +117,23 @@ class EpisodeStore:
         Raises:
             DamagedEpisodeError: where the file is not what the index says.
         """
-        return self._open(number, self.records[number].sha256)
-
-    def _map(self, number: int, sha256: str) -> Episode:
-        episode = map_episode(self.file(number), self.records[number], verify=sha256 not in self._verified)
-        self._verified.add(sha256)
+        record = self.records[number]
+        key = number, record.sha256
+        episode = self._mapped.pop(key, None)
+        if episode is None:
+            episode = map_episode(self.file(number), record, verify=record.sha256 not in self._verified)
+            self._verified.add(record.sha256)
+            while len(self._mapped) >= _OPEN_FILES:
+                del self._mapped[next(iter(self._mapped))]  # the one whose last use is longest ago
+        self._mapped[key] = episode
         return episode
 
 
 class EpisodeWriter(EpisodeStore):
     """A store that this process, and no other, changes: use it in a `with` statement.
 
-    Entering mends what a kill has left: half a line of the index, half a file, and a whole file without its line.
+    Entering mends what a kill has left: half a line of the index, half a file, and a whole file without its line. An
+    index that is lost, or ends in zeros, is rebuilt from the episodes' files, and stderr says so.
 
     Raises:
         ForbesError: on entering, where another process writes to the folder.
@@ -143,17 +142,41 @@ class EpisodeWriter(EpisodeStore):
     def __enter__(self) -> Self:
         self._stack = ExitStack()
         self._stack.enter_context(locked(self.path, "writes episodes here. Choose another folder"))
-        if self.index.is_file():
-            with open(self.index, "rb+", opener=no_link) as file:
-                file.truncate(file.read().rfind(b"\n") + 1)
-        for half in self.path.glob(".*.npz.*"):
+        lost = self.index.is_lost()
+        drop_half_line(self.index.path)
+        for half in [*self.path.glob(".*.npz.*"), *self.path.glob(".index.jsonl.*")]:
             half.unlink()
         self.refresh()
+        if lost:
+            self._rebuild()
         self._tidy()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
+
+    def _rebuild(self) -> None:
+        """Take the episodes that a lost index does not know from their files, and say so."""
+        unknown = [number for number in self.files() if number >= self.watermark]
+        found = sum(map(self._restore, unknown))
+        if unknown:
+            self.index.compact()
+            print(
+                f"WARNING: {self.index.path}: lost or overwritten with zeros; {found} of {len(unknown)} episodes are "
+                "restored from their files, those that cannot be are set aside, and forgotten ones no longer counted",
+                file=sys.stderr,
+            )
+
+    def _restore(self, number: int) -> bool:
+        """Take an episode from its file, unless it is damaged, of another number or of another environment."""
+        try:
+            record = read_record(self.file(number))
+        except ForbesError:
+            return False
+        fits = record.number == number and not self.index.differs(record)
+        if fits:
+            self.index.add(record)
+        return fits
 
     def append(self, episode: Episode, seed: int, policy: str, environment: dict[str, Any]) -> EpisodeRecord:
         """Add an episode: when this returns, it survives a power loss; if it raises, the store is as it was.
@@ -182,26 +205,19 @@ class EpisodeWriter(EpisodeStore):
             raise ForbesError(f"{self.file(number)}: not stored, {problem}. Mend the environment or the policy")
         content = pack_episode(episode, about)
         record = EpisodeRecord(**about, size=len(content), sha256=hashlib.sha256(content).hexdigest())
-        self._require_same_environment(record)
+        if name := self.index.differs(record):
+            there = next(iter(self.records.values())).settings.get(name)
+            raise ForbesError(
+                f"{self.path}: holds episodes whose {name} is {there}, not {record.settings.get(name)}. "
+                "Choose another folder"
+            )
         try:
             replace_file(self.file(number), content)
-            self._log(record._asdict())
-        except OSError as error:
+            self.index.append(record._asdict())
+        except ForbesError:
             self.file(number).unlink(missing_ok=True)
-            raise ForbesError(
-                f"{self.file(number)}: the episode cannot be written ({error.strerror}), those before it are "
-                "untouched. Make room, or choose another folder"
-            ) from error
-        self._apply(record._asdict())
+            raise
         return record
-
-    def _require_same_environment(self, record: EpisodeRecord) -> None:
-        ours = next(iter(self.records.values()), record).settings
-        for name in ours | record.settings:
-            if (there := ours.get(name)) != (here := record.settings.get(name)):
-                raise ForbesError(
-                    f"{self.path}: holds episodes whose {name} is {there}, not {here}. Choose another folder"
-                )
 
     def set_aside(self, watermark: int) -> int:
         """Go back to a checkpoint: move the episodes from this number on out of the way, and count them.
@@ -216,22 +232,21 @@ class EpisodeWriter(EpisodeStore):
             )
         later = sum(number >= watermark for number in self.records)
         if watermark < self.watermark:
-            self._log({"set_aside_from": watermark})
-            self.refresh()
+            self.index.append({"set_aside_from": watermark})
             self._tidy()
+            self.index.compact()
         return later
 
     def forget(self, before: int) -> None:
         """Delete the episodes before this number; one that a checkpoint may still draw must not be among them."""
-        if before > self.first:
-            self._log({"forgotten_before": before})
-            self.refresh()
+        if before > self.index.first:
+            self.index.append({"forgotten_before": before})
             self._tidy()
+            self.index.compact_if_long()
 
     def quarantine(self, number: int) -> None:
         """Take a damaged episode out of the store, and keep its file, if there is one, for the curious."""
-        self._log({"quarantined": number})
-        self.records.pop(number)
+        self.index.append({"quarantined": number})
         if self.file(number).exists():
             _move(self.file(number), self.path / "quarantine")
 
@@ -245,28 +260,14 @@ class EpisodeWriter(EpisodeStore):
                 found[number] = error.reason
         return found
 
-    def _log(self, line: dict[str, Any]) -> None:
-        """Append a line to the index, whole or not at all."""
-        content = json.dumps(line).encode() + b"\n"
-        with open(self.index, "ab", buffering=0, opener=no_link) as file:
-            size = file.tell()
-            try:
-                if file.write(content) < len(content):
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                os.fsync(file.fileno())
-            except OSError:
-                file.truncate(size)
-                raise
-        if size == 0:
-            fsync_folder(self.path)
-
     def _tidy(self) -> None:
         """Put the files that the index does not know aside, and delete the forgotten ones."""
-        for path in self.path.glob("[0-9]*.npz"):
-            if int(path.stem) < self.first:
-                path.unlink()
-            elif int(path.stem) not in self.records:
-                _move(path, self.path / "set_aside")
+        self._close_maps()
+        for number in self.files():
+            if number < self.index.first:
+                self.file(number).unlink()
+            elif number not in self.records:
+                _move(self.file(number), self.path / "set_aside")
 
 
 def first_held(records: Iterable[EpisodeRecord], capacity: int | None) -> int:

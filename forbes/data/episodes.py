@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
-from forbes.reading import is_number
+from forbes.reading import is_number, readable, shortened
 from forbes.shapes import printed_by_shape
 
-__all__ = ["DamagedEpisodeError", "Episode", "EpisodeRecord", "map_episode", "missing_in", "pack_episode"]
-__all__ += ["problem_of", "problem_with"]
+__all__ = ["DamagedEpisodeError", "Episode", "EpisodeRecord", "map_episode", "pack_episode"]
+__all__ += ["problem_of", "problem_with", "read_record"]
 
 _ARRAYS = ("observation", "action", "reward")
+_SHOWN = 60  # characters of a wrong value
 _LOCAL_HEADER = 30  # bytes before the name of a member of a zip archive
 
 
@@ -58,12 +59,23 @@ class Episode(NamedTuple):
 
 
 _FITS: dict[Any, Callable[[Any], bool]] = {
-    int: lambda value: type(value) is int and value >= 0,
-    float: is_number,
+    int: lambda value: type(value) is int and 0 <= value < 2**63,
+    float: lambda value: is_number(value) and -math.inf < value < math.inf,
     bool: lambda value: type(value) is bool,
     str: lambda value: type(value) is str,
     dict[str, Any]: lambda value: type(value) is dict,
 }
+_SAID: dict[str, Callable[[Any], bool]] = {
+    "task": _FITS[str],
+    "observation_shape": lambda value: type(value) is list and len(value) in (1, 3) and all(map(_is_size, value)),
+    "action_dim": lambda value: _is_size(value),
+    "discrete": _FITS[bool],
+}
+"""What a record must say of its environment, for those who draw from the episodes."""
+
+
+def _is_size(value: Any) -> bool:
+    return _FITS[int](value) and value > 0
 
 
 class EpisodeRecord(NamedTuple):
@@ -87,11 +99,12 @@ class EpisodeRecord(NamedTuple):
     sha256: str
     """Of the file."""
 
-    def require_types(self) -> None:
-        """Raise a TypeError where a value is not of its field's type, as in a damaged line of an index."""
+    def problem(self) -> str:
+        """Say what is wrong with its values, as in a damaged line of an index; empty where nothing is."""
         for name, kind in type(self).__annotations__.items():
-            if not _FITS[kind](getattr(self, name)):
-                raise TypeError(name)
+            if not _FITS[kind](value := getattr(self, name)):
+                return f"its {name} is {shortened(str(value), _SHOWN)}"
+        return "it has no step" if self.steps == 0 else problem_of_environment(self.environment)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -125,16 +138,20 @@ def problem_of(episode: Episode) -> str:
     return ""
 
 
-def missing_in(environment: dict[str, Any]) -> str:
-    """Name what a record does not say of its environment, and who draws from the episodes must know; or return ""."""
-    needed = ("task", "observation_shape", "action_dim", "discrete")
-    return next((name for name in needed if name not in environment), "")
+def problem_of_environment(environment: dict[str, Any]) -> str:
+    """Say what is wrong with what a record says of its environment; empty where nothing is."""
+    for name, fits in _SAID.items():
+        if name not in environment:
+            return f"its environment has no {name}, expected what `describe_environment` gives"
+        if not fits(value := environment[name]):
+            return f"its environment's {name} is {shortened(str(value), _SHOWN)}"
+    return "" if type(environment.get("made_by", {})) is dict else "its environment's made_by is no mapping"
 
 
 def problem_with(environment: dict[str, Any], episode: Episode) -> str:
     """Say what is wrong with what is recorded of an episode's environment; empty where nothing is."""
-    if name := missing_in(environment):
-        return f"its environment has no {name}, expected what `describe_environment` gives"
+    if problem := problem_of_environment(environment):
+        return problem
     arrays = {"observation_shape": list(episode.observation.shape[1:]), "action_dim": episode.action.shape[1]}
     for name, found in arrays.items():
         if environment[name] != found:
@@ -175,9 +192,31 @@ def map_episode(path: Path, record: EpisodeRecord, verify: bool) -> Episode:
     except (KeyError, ValueError, struct.error, zipfile.BadZipFile) as error:
         raise DamagedEpisodeError(path, str(error.args[0])) from error
     episode = Episode(observation, action, reward, record.terminated, record.frames)
-    if verify and (problem := problem_of(episode)):
+    problem = (verify and problem_of(episode)) or problem_with(record.environment, episode)
+    if not problem and len(reward) != record.steps + 1:
+        problem = f"it has {len(reward) - 1} steps, expected {record.steps}"
+    if problem:
         raise DamagedEpisodeError(path, problem)
     return episode
+
+
+def read_record(path: Path) -> EpisodeRecord:
+    """Read what a whole file says of its own episode.
+
+    Raises:
+        ForbesError: where it is damaged, or not a file of `pack_episode`.
+    """
+    content = path.read_bytes()
+    with (
+        readable(path, "an episode", "Put it aside"),
+        np.load(io.BytesIO(content), allow_pickle=False) as arrays,
+    ):
+        about = json.loads(arrays["meta"].item())
+        record = EpisodeRecord(**about, size=len(content), sha256=hashlib.sha256(content).hexdigest())
+    if problem := record.problem():
+        raise DamagedEpisodeError(path, problem)
+    map_episode(path, record, verify=True)
+    return record
 
 
 def _view(mapped: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:

@@ -154,13 +154,13 @@ class Experience(SequenceSource):
     def env_steps(self) -> int:
         """Frames of the simulator so far, action repeat included."""
         writer = self._open()
-        return writer.forgotten_frames + sum(record.frames for record in writer.records.values())
+        return writer.index.forgotten_frames + sum(record.frames for record in writer.records.values())
 
     @property
     def agent_steps(self) -> int:
         """Actions so far."""
         writer = self._open()
-        return writer.forgotten_steps + sum(record.steps for record in writer.records.values())
+        return writer.index.forgotten_steps + sum(record.steps for record in writer.records.values())
 
     @property
     def watermark(self) -> int | None:

@@ -1,5 +1,6 @@
 """Pictures of data: strips of an episode's frames, and how a picture is saved."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from forbes.data.episodes import Episode
 from forbes.errors import ForbesError
+from forbes.files import replace_file
 
 __all__ = ["MAX_CHANNELS", "draw_strips", "save_picture", "to_rgb"]
 
@@ -45,8 +47,10 @@ def draw_strips(episodes: Sequence[tuple[str, Episode]]) -> Figure:
 
 def save_picture(figure: Figure, output: Path) -> None:
     """Write a picture in the format of the path's suffix, and print the path."""
+    content = io.BytesIO()
     try:
-        figure.savefig(output, dpi=150)
-    except (OSError, ValueError) as error:
-        raise ForbesError(f"{output}: cannot be written ({error}). Choose another place or end it in .png.") from error
+        figure.savefig(content, format=output.suffix[1:] or "png", dpi=150)
+    except ValueError as error:
+        raise ForbesError(f"{output}: is no picture's name ({error}). End it in .png") from error
+    replace_file(output, content.getvalue())
     print(output)

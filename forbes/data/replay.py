@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from forbes.data.episode_store import EpisodeStore, first_held
-from forbes.data.episodes import EpisodeRecord, missing_in
+from forbes.data.episodes import EpisodeRecord
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError
 from forbes.seeding import generator
@@ -79,10 +79,6 @@ class Replay(SequenceSource):
         self.store.require_episodes()
         self._watermark = self.store.watermark
         environment = next(iter(self.store.records.values())).environment
-        if name := missing_in(environment):
-            raise ForbesError(
-                f"{self.store.index}: its episodes do not say the {name} of their environment. Collect them again"
-            )
         self.observation_shape: tuple[int, ...] = tuple(environment["observation_shape"])
         self.action_dim: int = environment["action_dim"]
         self.discrete: bool = environment["discrete"]

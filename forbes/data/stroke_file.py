@@ -124,10 +124,7 @@ def save_strokes(path: Path, splits: Mapping[str, StrokeArrays]) -> None:
     """Write a stroke file whose bytes depend on the arrays alone; a reader never sees half of it."""
     check_strokes(splits, path, "Nothing was written")
     arrays = {f"{split}_{name}": array for split, arrays in splits.items() for name, array in arrays._asdict().items()}
-    try:
-        replace_file(path, npz_bytes(arrays))
-    except OSError as error:
-        raise ForbesError(f"{path}: cannot be written ({error.strerror}). Choose another place.") from error
+    replace_file(path, npz_bytes(arrays))
 
 
 def sha256_of_arrays(splits: Mapping[str, StrokeArrays]) -> dict[str, str]:

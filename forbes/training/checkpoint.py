@@ -66,13 +66,7 @@ class AtomicCheckpointIO(CheckpointIO):
             if path.name == RunFolder.LAST and path.exists():
                 _keep_previous(path)
 
-        try:
-            replace_file(path, _sealed(buffer.getvalue()), keep_the_one_before)
-        except OSError as error:
-            raise ForbesError(
-                f"{path}: the checkpoint cannot be written ({error.strerror}), the one before it is untouched. "
-                "Make room or choose another --run_dir"
-            ) from error
+        replace_file(path, _sealed(buffer.getvalue()), keep_the_one_before)
 
     def load_checkpoint(
         self, path: str | os.PathLike[str], map_location: Any | None = None, weights_only: bool | None = None

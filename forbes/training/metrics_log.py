@@ -9,7 +9,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
-from forbes.files import no_link
+from forbes.files import append_whole, drop_half_line
 
 __all__ = ["JsonLinesLogger", "MarkStart"]
 
@@ -59,12 +59,10 @@ class JsonLinesLogger(Logger):
         self._append({"update": update, "start": True})
 
     def _append(self, record: dict[str, Any]) -> None:
-        with open(self.path, "ab", opener=no_link) as file:  # closed, hence flushed, at each line
-            if not self._whole:
-                content = self.path.read_bytes()
-                file.truncate(content.rfind(b"\n") + 1)  # a kill may have cut the last line short
-                self._whole = True
-            file.write(json.dumps(record).encode() + b"\n")
+        if not self._whole:
+            drop_half_line(self.path)
+            self._whole = True
+        append_whole(self.path, json.dumps(record).encode() + b"\n")
 
 
 class MarkStart(Callback):

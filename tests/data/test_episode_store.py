@@ -157,8 +157,8 @@ def test_half_a_line_of_the_index_is_no_episode(store):
     assert (store / "set_aside" / "000002.npz").is_file()  # whole, but its line was not
 
 
-@pytest.mark.parametrize("when", [1, 2, 3])
-def test_a_full_disk_leaves_the_store_as_it_was(store, when, monkeypatch):
+@pytest.mark.parametrize(("when", "name"), [(1, "000003.npz"), (2, "000003.npz"), (3, "index.jsonl")])
+def test_a_full_disk_leaves_the_store_as_it_was(store, when, name, monkeypatch):
     calls, sync, index = [], os.fsync, (store / "index.jsonl").read_bytes()
 
     def fsync(descriptor):
@@ -170,9 +170,7 @@ def test_a_full_disk_leaves_the_store_as_it_was(store, when, monkeypatch):
     with EpisodeWriter(store) as writer:
         with monkeypatch.context() as patch:
             patch.setattr(os, "fsync", fsync)
-            with pytest.raises(
-                ForbesError, match=r"000003.npz: the episode cannot be written \(No space left on device"
-            ):
+            with pytest.raises(ForbesError, match=rf"{name}: cannot be written \(No space left .*\)\. Make room"):
                 append(writer)
         assert (store / "index.jsonl").read_bytes() == index
         assert sorted(path.name for path in store.glob("*.npz")) == ["000000.npz", "000001.npz", "000002.npz"]
@@ -213,6 +211,38 @@ def test_the_oldest_are_forgotten(store):
 @pytest.mark.parametrize(("capacity", "first"), [(None, 0), (15, 0), (14, 1), (9, 2), (1, 2)])
 def test_what_a_capacity_holds_is_the_latest_whole_episodes(store, capacity, first):
     assert first_held(EpisodeStore(store).records.values(), capacity) == first
+
+
+def mapped_files(path):
+    """The files below a path that this process has mapped, deleted ones with a mark."""
+    with open("/proc/self/maps") as maps:
+        return {line.split(maxsplit=5)[5].strip() for line in maps if str(path) in line}
+
+
+@pytest.mark.parametrize("of", ["the writer", "a reader"])
+def test_a_forgotten_episode_leaves_the_disk_though_it_was_open(store, of):
+    with EpisodeWriter(store) as writer:
+        reader = writer if of == "the writer" else EpisodeStore(store)
+        assert all(reader.episode(number).reward[1] > 0 or number == 0 for number in range(3))
+        assert len(mapped_files(store)) == 3
+        writer.forget(2)
+        reader.refresh()
+
+    assert mapped_files(store) == {f"{store}/000002.npz"}
+
+
+def test_names_that_the_store_does_not_give_are_left_alone(store):
+    names = {"000004-2.npz", "000004 (copy).npz", "7.npz", "0000001.npz", "notes.npz", "00000\u0664.npz"}
+    for name in names:
+        (store / name).touch()
+
+    with EpisodeWriter(store) as writer:
+        append(writer)
+        writer.forget(1)
+        writer.set_aside(2)
+
+    assert names < {path.name for path in store.iterdir()}
+    assert numbers(store) == [1]
 
 
 DAMAGE = {
