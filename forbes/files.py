@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,23 +147,16 @@ def locked(folder: Path, complaint: str) -> Iterator[None]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     require_no_links(folder.rglob("*"))
-    with open(folder / ".lock", "a+", opener=no_link) as file:
+    with open(folder / ".lock", "ab+", buffering=0, opener=no_link) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             file.seek(0)
-            raise ForbesError(f"{folder}: {file.read()} {complaint}") from error
-        with writing(folder / ".lock"):
-            _replace_content(file, f"process {os.getpid()} on {platform.node()}")
+            raise ForbesError(f"{folder}: {file.read().decode()} {complaint}") from error
+        with writing(folder / ".lock"):  # not a new file, which would not be locked
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {platform.node()}".encode())
         yield
-
-
-def _replace_content(file: TextIO, content: str) -> None:
-    """Write a small file anew without a new inode, which would lose its lock."""
-    file.seek(0)
-    file.truncate()
-    file.write(content)
-    file.flush()
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:

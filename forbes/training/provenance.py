@@ -72,10 +72,9 @@ class RecordRun(SaveConfigCallback):
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Note failure, or the signal that has ended the training."""
-        if self.stop.received is not None:
-            self._end(self.stop.exit_status)
-        else:
-            self._end(exception.exit_status if isinstance(exception, ForbesError) else 1)
+        failed = exception.exit_status if isinstance(exception, ForbesError) else 1
+        with suppress(ForbesError):  # on a full disk; why the training has failed is worth more than its record
+            self._end(failed if self.stop.received is None else self.stop.exit_status)
 
     def _end(self, exit_status: int) -> None:
         if self.already_saved:

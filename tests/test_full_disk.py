@@ -1,0 +1,263 @@
+"""A disk or a quota that is full: the file that cannot be written is named, and what was there stays whole."""
+
+import errno
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from forbes.cli import main
+from forbes.data.download import download
+from forbes.data.episode_store import EpisodeStore, EpisodeWriter
+from forbes.data.episodes import Episode
+from forbes.data.pictures import save_picture
+from forbes.data.stroke_file import load_strokes, save_strokes
+from forbes.errors import ForbesError
+from forbes.evaluation.record import write_record
+from forbes.evaluation.scoring import Parts
+from forbes.figures.style import save_figure
+from forbes.files import append_whole, locked, replace_file
+from forbes.training.checkpoint import AtomicCheckpointIO
+from forbes.training.metrics_log import JsonLinesLogger
+from forbes.training.run_folder import read_metrics
+
+LIMIT = 4000  # bytes of a file: more than an episode below, less than the index of ten
+ENVIRONMENT = {"task": "Counting", "observation_shape": [2], "action_dim": 1, "discrete": False}
+
+
+@contextmanager
+def small_files(limit=LIMIT):
+    """Let no process of ours write more bytes to a file."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def append_episodes(folder, count=20, steps=5):
+    with EpisodeWriter(folder) as writer:
+        for _ in range(count):
+            time = np.arange(steps + 1, dtype=np.float32)
+            whole = Episode(np.stack([time, time], 1), time[:, None] / 100, time, terminated=False, frames=steps)
+            writer.append(whole, seed=1, policy="test", environment=ENVIRONMENT)
+
+
+def log_metrics(folder):
+    folder.mkdir(exist_ok=True)
+    logger = JsonLinesLogger(folder / "metrics.jsonl")
+    for update in range(300):
+        logger.log_metrics({"train/elbo": -1.5}, update)
+
+
+def save_all_strokes(folder, strokes_file):
+    splits = {split: arrays for split, arrays in load_strokes(strokes_file, "").items()}
+    many = splits["train"]
+    while len(many.points) < 4 * LIMIT:
+        ends = many.offsets[1:] + len(many.points)
+        points = np.concatenate([many.points, np.random.default_rng(len(many.points)).permuted(many.points)])
+        joined = [np.concatenate([values, values]) for values in (many.pen_up, many.labels)]
+        many = many._replace(points=points, pen_up=joined[0], offsets=np.append(many.offsets, ends), labels=joined[1])
+    save_strokes(folder / "strokes.npz", splits | {"train": many})
+
+
+def plot(folder, save, name):
+    figure = Figure()
+    figure.subplots().plot(np.random.default_rng(0).normal(size=2000))
+    save(figure, folder / name)
+
+
+MANY = torch.randn(1000, dtype=torch.float64)
+WRITERS = {
+    "report": lambda folder, _: replace_file(folder / "report", bytes(LIMIT + 1)),
+    "last.ckpt": lambda folder, _: AtomicCheckpointIO().save_checkpoint({"weight": MANY}, folder / "last.ckpt"),
+    "metrics.jsonl": lambda folder, _: log_metrics(folder),
+    "000000.npz": lambda folder, _: append_episodes(folder, steps=1000),
+    "index.jsonl": lambda folder, _: append_episodes(folder),
+    "evaluation.npz": lambda folder, _: write_record(folder, {"elbo": {"mean": 1.0}}, {"elbo": MANY}),
+    "0.npz": lambda folder, _: Parts(folder, "key").write(0, {"elbo": MANY}),
+    "figure.pdf": lambda folder, _: plot(folder, save_figure, "figure.pdf"),
+    "picture.png": lambda folder, _: plot(folder, save_picture, "picture.png"),
+    "strokes.npz": save_all_strokes,
+}
+
+
+def left_whole(folder):
+    """Check that nothing is half written, and list the names that are there."""
+    files = [path for path in folder.rglob("*") if path.is_file() and not path.name.endswith(".lock")]
+    for path in files:
+        assert not path.name.startswith(".")
+        if path.suffix == ".jsonl":
+            assert path.read_text().endswith("}\n")
+            assert all(map(json.loads, path.read_text().splitlines()))
+    return {path.name for path in files}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_file_that_grows_too_large_is_named_with_a_remedy(name, tmp_path, strokes_file):
+    with (
+        small_files(),
+        pytest.raises(ForbesError, match=rf"/{name}: cannot be written \(File too large\)\. Allow larger files \("),
+    ):
+        WRITERS[name](tmp_path / "folder", strokes_file)
+
+    appended = {"metrics.jsonl", "index.jsonl"}
+    assert left_whole(tmp_path / "folder") >= {name} & appended
+    if name not in appended:
+        assert left_whole(tmp_path / "folder") == set()
+
+
+def test_a_download_that_grows_too_large_is_named_and_goes_on_later(tmp_path):
+    content = os.urandom(3 * 2**16)
+    (tmp_path / "served").write_bytes(content)
+    url, path = (tmp_path / "served").as_uri(), tmp_path / "fetched"
+
+    with small_files(2**17), pytest.raises(ForbesError, match=r"/fetched\.part: cannot be written \(File too large\)"):
+        download(url, path, "Try again")
+    assert (tmp_path / "fetched.part").read_bytes() == content[: 2**17]
+
+    download(url, path, "Try again")
+    assert path.read_bytes() == content
+
+
+def test_a_store_whose_index_is_full_has_whole_episodes_and_takes_more_later(tmp_path):
+    with small_files(), pytest.raises(ForbesError):
+        append_episodes(tmp_path)
+    stored = EpisodeStore(tmp_path)
+    assert len(stored.records) > 5
+    assert stored.files() == list(stored.records)
+
+    append_episodes(tmp_path, 1)
+    assert len(EpisodeStore(tmp_path).records) == len(stored.records) + 1
+
+
+REMEDIES = {errno.ENOSPC: "Make room, or", errno.EDQUOT: "Make room in your quota", errno.EFBIG: "Allow larger files"}
+
+
+@pytest.mark.parametrize("number", REMEDIES)
+@pytest.mark.parametrize("write", [replace_file, lambda path, content: append_whole(path, content, sync=True)])
+def test_each_kind_of_full_has_its_remedy_and_leaves_the_file_as_it_was(number, write, tmp_path, monkeypatch):
+    (tmp_path / "report").write_bytes(b"old")
+
+    def full(descriptor):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ForbesError, match=rf"report: cannot be written \({os.strerror(number)}\)\. {REMEDIES[number]}"):
+        write(tmp_path / "report", b"new")
+
+    assert [path.name for path in tmp_path.iterdir()] == ["report"]
+    assert (tmp_path / "report").read_bytes() == b"old"
+
+
+def test_a_full_disk_that_another_library_meets_is_one_sentence(monkeypatch, capsys):
+    for name, said in (("there", "there: cannot be written"), (None, "the output: cannot be written")):
+
+        def full(arguments, name=name):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *([name] if name else []))
+
+        monkeypatch.setattr("forbes.doctor.main", full)
+        assert main(["doctor"]) == 2
+        assert (
+            capsys.readouterr().err == f"forbes: {said} (No space left on device). Make room, or choose another place\n"
+        )
+
+
+@pytest.mark.parametrize("when", range(2, 9))
+def test_a_training_on_a_full_disk_names_the_file_and_goes_on_when_there_is_room(
+    tiny_config, tiny_run, tmp_path, monkeypatch, capsys, when
+):
+    """The disk is full from the n-th file on, also for what is written because the training has failed."""
+    calls, sync = [], os.fsync
+
+    def fsync(descriptor):
+        calls.append(os.readlink(f"/proc/self/fd/{descriptor}"))
+        if len(calls) >= when:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(descriptor)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fsync)
+        assert main(["fit", "--config", str(tiny_config), "--run_dir", str(tmp_path / "run")]) == 2
+
+    *_, said = capsys.readouterr().err.splitlines()
+    assert said.startswith(f"forbes: {tmp_path / 'run'}/")
+    assert said.endswith("cannot be written (No space left on device). Make room, or choose another place")
+    first = calls[when - 1]
+    name = os.path.basename(first).removeprefix(".").rpartition(".")[0] if "." in os.path.basename(first) else ""
+    assert name in said
+    resumed = (tmp_path / "run" / "checkpoints" / "last.ckpt").exists()
+    again = ["--resume", str(tmp_path / "run")] if resumed else ["--config", str(tiny_config), "--run_dir"]
+    assert main(["fit", *again, *([] if resumed else [str(tmp_path / "run")])]) == 0
+    pd.testing.assert_frame_equal(read_metrics(tmp_path / "run"), read_metrics(tiny_run), check_exact=True)
+
+
+ON_A_FULL_DISK = """
+import json, sys
+from pathlib import Path
+from test_full_disk import append_episodes, left_whole, log_metrics
+from forbes.data.episode_store import EpisodeStore, EpisodeWriter
+from forbes.errors import ForbesError
+from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
+
+disk, said = Path(sys.argv[1]), []
+AtomicCheckpointIO().save_checkpoint({"number": 0}, disk / "last.ckpt")
+large = {"number": 1, "noise": list(range(10**5))}
+for fill in (
+    lambda: append_episodes(disk / "store", 10**6),
+    lambda: [log_metrics(disk) for _ in range(10**4)],
+    lambda: AtomicCheckpointIO().save_checkpoint(large, disk / "last.ckpt"),
+):
+    try:
+        fill()
+    except ForbesError as error:
+        said.append(str(error))
+left_whole(disk)
+store = EpisodeStore(disk / "store")
+assert store.files() == list(store.records)
+assert read_checkpoint(disk / "last.ckpt") == {"number": 0}
+with EpisodeWriter(disk / "store") as writer:
+    (disk / "metrics.jsonl").unlink()
+    writer.forget(len(store.records) - 1)
+append_episodes(disk / "store", 1)
+print(json.dumps(said))
+"""
+
+
+def test_a_disk_that_is_really_full_loses_nothing_and_is_named(tmp_path):
+    inside = f"mount -t tmpfs -o size=300k none {tmp_path}"
+    private = ["unshare", "--mount", "--map-root-user", "sh", "-c"]
+    if shutil.which("unshare") is None or subprocess.run([*private, inside], capture_output=True).returncode:
+        pytest.skip("no file system can be mounted here")
+
+    command = f'{inside} && exec "$0" -c "$1" {tmp_path}'
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), *sys.path])}
+    done = subprocess.run(
+        [*private, command, sys.executable, ON_A_FULL_DISK], capture_output=True, text=True, env=environment
+    )
+
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert len(said) == 3
+    assert all(
+        "cannot be written (No space left on device). Make room, or choose another place" in each for each in said
+    )
+    assert [part in each for part, each in zip(("/store/", "/metrics.jsonl", "/last.ckpt"), said, strict=True)] == [
+        True
+    ] * 3
+
+
+def test_a_lock_that_cannot_be_written_is_named(tmp_path):
+    with small_files(0), pytest.raises(ForbesError, match=r"\.lock: cannot be written \(File too large\)"):
+        with locked(tmp_path, "works here"):
+            pass
