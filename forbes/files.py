@@ -10,6 +10,8 @@ import io
 import os
 import platform
 import secrets
+import shutil
+import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 from forbes.errors import ForbesError, unwritable
 
 __all__ = ["append_whole", "drop_half_line", "fsync_folder", "locked", "no_link", "npz_bytes", "replace_file"]
-__all__ += ["require_no_links", "writing"]
+__all__ += ["require_no_links", "require_room", "writing"]
 
 
 @contextmanager
@@ -123,6 +125,30 @@ def _is_link(path: Path | str) -> ForbesError:
     return ForbesError(
         f"{path}: is a symbolic link, expected what it names itself. Put that in its place, or delete it"
     )
+
+
+def require_room(folder: Path, what: str, likely: float, least: float = 0) -> None:
+    """Compare what will be written with the room on the disk; warn where it will probably not fit.
+
+    Args:
+        folder: that it will be written to.
+        what: it is, for the sentence: "checkpoints".
+        likely: bytes that it will probably take.
+        least: bytes that it will take for certain.
+
+    Raises:
+        ForbesError: where not even the least of it fits.
+    """
+    free = shutil.disk_usage(folder).free
+    there = f"and {_size(free)} are free. Make room, or choose another place"
+    if free < least:
+        raise ForbesError(f"{folder}: {what} take at least {_size(least)}, {there}")
+    if free < likely:
+        warnings.warn(f"{folder}: {what} will take about {_size(likely)}, {there}", stacklevel=2)
+
+
+def _size(count: float) -> str:
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.1f} MiB"
 
 
 def fsync_folder(folder: Path) -> None:

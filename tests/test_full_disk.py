@@ -7,13 +7,16 @@ import resource
 import shutil
 import subprocess
 import sys
+import warnings
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 from matplotlib.figure import Figure
+from small_agents import fit, forbes, write_config
 
 from forbes.cli import main
 from forbes.data.download import download
@@ -26,7 +29,8 @@ from forbes.evaluation.record import write_record
 from forbes.evaluation.scoring import Parts
 from forbes.figures.style import save_figure
 from forbes.files import append_whole, locked, replace_file
-from forbes.training.checkpoint import AtomicCheckpointIO
+from forbes.training.callbacks import collect
+from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
 from forbes.training.metrics_log import JsonLinesLogger
 from forbes.training.run_folder import read_metrics
 
@@ -261,3 +265,64 @@ def test_a_lock_that_cannot_be_written_is_named(tmp_path):
     with small_files(0), pytest.raises(ForbesError, match=r"\.lock: cannot be written \(File too large\)"):
         with locked(tmp_path, "works here"):
             pass
+
+
+@contextmanager
+def free(monkeypatch, count):
+    """Let every disk have so many bytes left."""
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=count))
+        yield
+
+
+def weights_of(run):
+    state = read_checkpoint(run / "checkpoints" / "last.ckpt")["state_dict"]
+    return sum(values.nbytes for values in state.values())
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.9, "refused"), (1.1, "warned"), (8.9, "warned"), (9.1, "fits")])
+def test_a_training_whose_checkpoints_will_not_fit_is_told_before_it_begins(
+    share, said, tiny_config, tiny_run, tmp_path, monkeypatch, capsys
+):
+    """Three files, of the weights and two moments for each of them: refused where not even the weights fit."""
+    command = ["fit", "--config", str(tiny_config), "--run_dir", str(tmp_path / "run"), "--trainer.max_epochs", "1"]
+    with free(monkeypatch, share * weights_of(tiny_run)), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert main(command) == (2 if said == "refused" else 0)
+
+    told = [str(each.message) for each in caught if "checkpoints will take about" in str(each.message)]
+    assert len(told) == (said == "warned")
+    assert ("checkpoints take at least" in capsys.readouterr().err) == (said == "refused")
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").exists() == (said != "refused")
+
+
+def test_a_checkpoint_has_the_weights_and_two_moments(tiny_run):
+    """What the estimate counts; names and counters, which it leaves out, are small beside those of a real model."""
+    (optimizer,) = read_checkpoint(tiny_run / "checkpoints" / "last.ckpt")["optimizer_states"]
+    tensors = [value for state in optimizer["state"].values() for value in state.values() if value.ndim]
+
+    assert sum(value.nbytes for value in tensors) == 2 * weights_of(tiny_run)
+
+
+@pytest.mark.parametrize(("count", "warns"), [(17, False), (22, True)])
+def test_collecting_more_episodes_than_fit_is_said_when_the_first_is_there(count, warns, tmp_path, monkeypatch):
+    command = ["data", "collect", "--task", "Parrot", "-o", str(tmp_path / "store"), "--episodes"]
+    assert forbes(*command, 1) == 0
+    size = EpisodeStore(tmp_path / "store").records[0].size
+    with free(monkeypatch, 16.5 * size), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert forbes(*command, count) == 0
+    assert any("the episodes to come will take about" in str(each.message) for each in caught) == warns
+
+
+@pytest.mark.parametrize(("capacity", "more"), [(1000, 2), (24, 1), (16, 0)])
+def test_the_episodes_of_an_agent_are_foreseen_when_the_first_are_there(capacity, more, tmp_path, monkeypatch):
+    """Two of 8 steps are followed by two more; a capacity of 24 steps has room for one of them, 16 for none."""
+    foreseen = []
+    monkeypatch.setattr(collect, "require_room", lambda folder, what, likely: foreseen.append((folder, likely)))
+    run = tmp_path / "run"
+    assert fit("--config", write_config(tmp_path), "--data.source.capacity", capacity, "--run_dir", run) == 0
+
+    ((folder, likely),) = foreseen
+    assert folder == run
+    assert likely == pytest.approx(more * EpisodeStore(run / "episodes").records[0].size, rel=0.02)

@@ -41,6 +41,13 @@ class Parrot(Echo):
         return {"task": "Parrot", "steps": self.steps}
 
 
+class Endless(Parrot):
+    """Never ends."""
+
+    def __init__(self):
+        super().__init__(steps=None)
+
+
 class Troubled(Echo):
     """An echo that goes wrong at its third step, `times` times in all; `ledger` is a file that counts them."""
 

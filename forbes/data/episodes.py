@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from forbes.envs import TIME_LIMIT
 from forbes.errors import ForbesError
 from forbes.reading import is_number, readable, shortened
 from forbes.shapes import printed_by_shape
@@ -109,7 +110,8 @@ class EpisodeRecord(NamedTuple):
     @property
     def settings(self) -> dict[str, Any]:
         """Give what all the episodes of a store must have in common."""
-        return {name: value for name, value in self.environment.items() if name != "made_by"}
+        settings = {"time_limit": TIME_LIMIT} | self.environment  # which records of older versions do not say
+        return {name: value for name, value in settings.items() if name != "made_by"}
 
 
 class DamagedEpisodeError(ForbesError):

@@ -13,7 +13,7 @@ from forbes.data.episodes import EpisodeRecord
 from forbes.data.player import Player
 from forbes.data.replay import Replay, Windows
 from forbes.data.source import SequenceBatch, SequenceSource, Split
-from forbes.envs import EnvironmentProcess, find_environment
+from forbes.envs import TIME_LIMIT, EnvironmentProcess, find_environment
 from forbes.errors import ForbesError
 
 __all__ = ["Experience"]
@@ -30,17 +30,26 @@ class Experience(SequenceSource):
         options: of its environment, e.g. `{pixels: false, action_repeat: 4}`.
         capacity: agent steps of the latest episodes that are kept; None keeps all.
         timeout: seconds in which the environment must answer; one that does not is started anew.
+        time_limit: steps after which an episode that has not ended by itself is truncated.
 
     Raises:
-        ForbesError: for an unknown task or option, or a timeout that is not above 0.
+        ForbesError: for an unknown task or option, a timeout that is not above 0, or a time_limit below 1.
     """
 
     def __init__(
-        self, task: str, options: dict[str, Any] | None = None, capacity: int | None = None, timeout: float = 60.0
+        self,
+        task: str,
+        options: dict[str, Any] | None = None,
+        capacity: int | None = None,
+        timeout: float = 60.0,
+        time_limit: int = TIME_LIMIT,
     ) -> None:
         if not timeout > 0:
             raise ForbesError(f"Experience: timeout is {timeout}, expected seconds above 0. Choose another")
-        self.task, self.options, self.capacity, self.timeout = task, options or {}, capacity, timeout
+        if time_limit < 1:
+            raise ForbesError(f"Experience: time_limit is {time_limit}, expected at least 1 step. Choose another")
+        self.task, self.options, self.capacity = task, options or {}, capacity
+        self.timeout, self.time_limit = timeout, time_limit
         self._make = find_environment(task, **self.options)
         self._writer: EpisodeWriter | None = None
         self._replay: Replay | None = None
@@ -49,12 +58,12 @@ class Experience(SequenceSource):
     @cached_property
     def environment(self) -> EnvironmentProcess:
         """The environment, in a process that starts when it is first asked for."""
-        return EnvironmentProcess(self._make, self.timeout)
+        return EnvironmentProcess(self._make, self.timeout, self.time_limit)
 
     @cached_property
     def player(self) -> Player:
         """What plays while this process trains; it starts when it is first asked for."""
-        return Player(self._make, self.timeout)
+        return Player(self._make, self.timeout, self.time_limit)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:  # type: ignore[override]
@@ -134,6 +143,15 @@ class Experience(SequenceSource):
         writer = self._open()
         writer.forget(first_held([*writer.records.values()][:-1], self.capacity))
         self._look()
+
+    def growth(self, episodes: int) -> float:
+        """Estimate the bytes by which so many further episodes make the store grow, from those that are there."""
+        records = self._open().records.values()
+        steps = sum(record.steps for record in records)
+        more = episodes * steps / len(records)
+        if self.capacity is not None:
+            more = min(more, max(0, self.capacity - steps))
+        return more * sum(record.size for record in records) / steps
 
     def begun(self, policy: str, seed: int, most: int) -> int:
         """Count the first episodes, of at most so many, that `collect` with these arguments would play again."""

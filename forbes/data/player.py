@@ -10,7 +10,7 @@ import torch
 
 from forbes.data.collection import MakePolicy, play_whole
 from forbes.data.episodes import Episode
-from forbes.envs import Environment, EnvironmentProcess, belong_to_parent
+from forbes.envs import TIME_LIMIT, Environment, EnvironmentProcess, belong_to_parent
 from forbes.errors import ForbesError
 
 __all__ = ["Player"]
@@ -25,12 +25,13 @@ class Player:
     Args:
         make: makes the environment.
         timeout: see `EnvironmentProcess`.
+        time_limit: likewise.
     """
 
-    def __init__(self, make: Callable[[], Environment], timeout: float = 60.0) -> None:
+    def __init__(self, make: Callable[[], Environment], timeout: float = 60.0, time_limit: int = TIME_LIMIT) -> None:
         spawn = multiprocessing.get_context("spawn")
         self._connection, theirs = spawn.Pipe()
-        self._process = spawn.Process(target=_serve, args=(theirs, make, timeout))
+        self._process = spawn.Process(target=_serve, args=(theirs, make, timeout, time_limit))
         self._process.start()
         theirs.close()  # so that the end of the process is the end of the pipe
 
@@ -72,12 +73,12 @@ class Player:
         self._connection.close()
 
 
-def _serve(connection: Connection, make: Callable[[], Environment], timeout: float) -> None:
+def _serve(connection: Connection, make: Callable[[], Environment], timeout: float, time_limit: int) -> None:
     """Run in the process: play what is asked for until the parent is gone."""
     belong_to_parent()
     torch.set_num_threads(1)
     try:
-        with EnvironmentProcess(make, timeout) as environment:
+        with EnvironmentProcess(make, timeout, time_limit) as environment:
             while True:
                 make_policy, number, seed = connection.recv()
                 connection.send(play_whole(environment, make_policy, seed, number))

@@ -3,13 +3,14 @@
 Nothing here imports a simulator, torch or gymnasium before it is asked for: a worker starts in a fraction of a second.
 """
 
-from forbes.envs.base import Environment, Step
+from forbes.envs.base import TIME_LIMIT, Environment, Step
 from forbes.envs.control import DeepMindControl
 from forbes.envs.gymnasium import Gymnasium
 from forbes.envs.tasks import find_environment
 from forbes.envs.worker import BrokenEnvironmentError, EnvironmentProcess, belong_to_parent
 
 __all__ = [
+    "TIME_LIMIT",
     "BrokenEnvironmentError",
     "DeepMindControl",
     "Environment",

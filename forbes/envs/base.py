@@ -11,6 +11,7 @@ from forbes.errors import ForbesError
 from forbes.shapes import printed_by_shape
 
 __all__ = [
+    "TIME_LIMIT",
     "Environment",
     "Step",
     "check_environment",
@@ -20,6 +21,10 @@ __all__ = [
     "require_repeat",
     "scale_action",
 ]
+
+
+TIME_LIMIT = 100_000
+"""Steps after which an episode that has not ended is truncated. Atari's, the longest common ones, have 27,000."""
 
 
 @printed_by_shape

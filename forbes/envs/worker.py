@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from forbes.envs.base import Environment, Step, check_environment, check_step
+from forbes.envs.base import TIME_LIMIT, Environment, Step, check_environment, check_step
 from forbes.errors import ForbesError
 
 __all__ = ["BrokenEnvironmentError", "EnvironmentProcess", "belong_to_parent"]
@@ -65,15 +65,16 @@ class EnvironmentProcess(Environment):
     Args:
         make: makes the environment; what `find_environment` gives, a class, or a `functools.partial` of one.
         timeout: seconds in which a reset or a step must be answered.
+        time_limit: steps after which an episode that has not ended by itself is truncated, so that each has an end.
 
     Raises:
         BrokenEnvironmentError: where the environment cannot be built.
         ForbesError: where it says why, in a sentence, or another process cannot import what makes it.
     """
 
-    def __init__(self, make: Callable[[], Environment], timeout: float = 60.0) -> None:
+    def __init__(self, make: Callable[[], Environment], timeout: float = 60.0, time_limit: int = TIME_LIMIT) -> None:
         _require_importable(make)
-        self.make, self._timeout = make, timeout
+        self.make, self._timeout, self._time_limit = make, timeout, time_limit
         self._process: multiprocessing.process.BaseProcess | None = None
         self._start()
 
@@ -81,17 +82,22 @@ class EnvironmentProcess(Environment):
         """See `Environment.reset`; raises BrokenEnvironmentError."""
         if self._process is None:
             self._start()
+        self._steps = 0
         return self._ask("reset", seed)
 
     def step(self, action: NDArray[np.float32]) -> Step:
         """See `Environment.step`; raises BrokenEnvironmentError, after which there must be a reset."""
         if self._process is None:
             raise BrokenEnvironmentError(f"{self._name}: the episode is broken, expected a reset before the next step")
-        return self._ask("step", action)
+        step = self._ask("step", action)
+        self._steps += 1
+        if self._steps >= self._time_limit and not step.terminated:
+            return step._replace(truncated=True)
+        return step
 
     def describe(self) -> dict[str, Any]:
-        """See `Environment.describe`."""
-        return self._description
+        """See `Environment.describe`; with the limit of steps, which determines an episode too."""
+        return self._description | {"time_limit": self._time_limit}
 
     def close(self) -> None:
         """End the process, however busy it is."""

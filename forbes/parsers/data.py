@@ -108,6 +108,7 @@ def _add_collect(of_data: _Parser) -> None:
     play.add_argument("--part", help="of Gymnasium: the entry of a Dict that is observed")
     play.add_argument("--camera", type=int, help="number of the camera")
     play.add_argument("--fast", action="store_const", const=True, help="no shadows: other pixels")
+    play.add_argument("--time-limit", type=positive, metavar="STEPS", help="truncate longer episodes (100,000)")
     play.add_argument("--timeout", type=float, help="seconds for an answer of the environment (60)")
 
 

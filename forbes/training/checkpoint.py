@@ -16,7 +16,7 @@ from lightning.fabric.plugins import CheckpointIO
 from lightning.pytorch.callbacks import Callback, Checkpoint
 
 from forbes.errors import ForbesError
-from forbes.files import replace_file
+from forbes.files import replace_file, require_room
 from forbes.reading import readable
 from forbes.training.run_folder import RunFolder
 
@@ -90,6 +90,16 @@ class SaveLast(Checkpoint):
 
     def __init__(self, run: RunFolder) -> None:
         self.run = run
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Estimate the room: weights and Adam's two moments, of the last checkpoint, the one before and a new one.
+
+        Raises:
+            ForbesError: where not even the weights fit once.
+        """
+        weights = sum(values.numel() * values.element_size() for values in pl_module.state_dict().values())
+        missing = 3 - len([*self.run.checkpoint.parent.glob("*.ckpt")])
+        require_room(self.run.path, "checkpoints", likely=3 * weights * max(missing, 1), least=weights)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save; every other callback has ended its epoch.

@@ -10,8 +10,10 @@ from rich.progress import track
 from forbes.data.collection import MakePolicy, collect_episodes, random_policy
 from forbes.data.episode_commands import count_steps
 from forbes.data.episode_store import EpisodeWriter
+from forbes.data.episodes import EpisodeRecord
 from forbes.envs import Environment, EnvironmentProcess, find_environment
 from forbes.errors import ForbesError
+from forbes.files import require_room
 from forbes.training.acting import Acting
 from forbes.training.loading import loaded_agent
 
@@ -28,7 +30,7 @@ def collect(output: Path, episodes: int, policy: str, seed: int, **environment: 
         episodes: how many have been stored in the end, those of earlier calls included.
         policy: "random", or the run folder of an agent, which explores as in its training.
         seed: episode n is a function of (seed, n) and the policy.
-        environment: task, options of its constructor and seconds for an answer; None where it is not said.
+        environment: task, options of its constructor, seconds for an answer and most steps; None where it is not said.
 
     Raises:
         ForbesError: where there is no such task or run, an agent is given another task, or an episode breaks.
@@ -37,7 +39,11 @@ def collect(output: Path, episodes: int, policy: str, seed: int, **environment: 
     with _acting(policy, given) as (played_in, make_policy), EpisodeWriter(output) as writer:
         missing = max(0, episodes - writer.watermark)
         played = collect_episodes(played_in, writer, make_policy, policy, episodes, seed)
-        records = list(track(played, f"Playing {played_in.describe()['task']}", total=missing))
+        records: list[EpisodeRecord] = []
+        for record in track(played, f"Playing {played_in.describe()['task']}", total=missing):
+            if not records:
+                require_room(output, "the episodes to come", (missing - 1) * record.size)
+            records.append(record)
     print(f"{output}: {len(records)} episodes stored, {count_steps(records)}; {writer.watermark} in all")
 
 
@@ -55,6 +61,6 @@ def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, M
     elif "task" not in given:
         raise ForbesError(f"--policy {_RANDOM}: needs an environment. Name one: --task TASK")
     else:
-        timeout = given.pop("timeout", 60.0)
-        with EnvironmentProcess(find_environment(**given), timeout) as environment:
+        limits = {name: given.pop(name) for name in ("timeout", "time_limit") if name in given}
+        with EnvironmentProcess(find_environment(**given), **limits) as environment:
             yield environment, random_policy

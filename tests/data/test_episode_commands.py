@@ -61,6 +61,28 @@ def test_info_says_what_there_is_and_draws_it(pictures, tmp_path, capsys):
     assert white > 0.1
 
 
+def test_an_episode_without_an_end_is_truncated_at_the_limit_that_is_given(tmp_path):
+    collect = ["data", "collect", "--task", "Endless", "-o", str(tmp_path), "--episodes"]
+    assert main([*collect, "2", "--time-limit", "7"]) == 0
+
+    records = EpisodeStore(tmp_path).records.values()
+    assert [(record.steps, record.terminated, record.environment["time_limit"]) for record in records] == [
+        (7, False, 7)
+    ] * 2
+
+
+def test_a_store_of_another_limit_of_steps_is_another_store(tmp_path, capsys):
+    collect = ["collect", "--task", "Parrot", "-o", tmp_path, "--episodes"]
+    assert main(["data", *map(str, collect), "1"]) == 0
+    sentence = "holds episodes whose time_limit is 100000, not 7. Choose another folder"
+    assert sentence in error_of(capsys, *collect, 2, "--time-limit", 7)
+
+    index = tmp_path / "index.jsonl"  # of a version that had no limit: one that nobody reached
+    index.write_text(index.read_text().replace(', "time_limit": 100000', ""))
+    assert main(["data", *map(str, collect), "2"]) == 0
+    assert len(EpisodeStore(tmp_path).records) == 2
+
+
 def test_an_environment_that_hangs_ends_the_command_and_leaves_nothing_half_written(tmp_path, capsys):
     collect = [
         "data",

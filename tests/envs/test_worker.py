@@ -45,6 +45,21 @@ def test_it_lives_elsewhere_and_without_torch(echo):
     assert not echo.describe()["torch"]
 
 
+@pytest.mark.parametrize(("ends", "limit"), [(None, 4), (4, 4), (6, 4), (4, 6)])
+def test_an_episode_is_truncated_at_the_limit_of_steps_unless_it_ends_before(ends, limit):
+    """`ends` is the step at which the process itself terminates: an end at the limit stays an end."""
+    with EnvironmentProcess(partial(Echo, ends, True), time_limit=limit) as environment:
+        for _ in range(2):  # the count begins again with each reset
+            steps = [environment.reset(3), *(environment.step(ACTIONS[0]) for _ in range(4))]
+
+            assert [step.truncated for step in steps] == [False] * 4 + [ends != 4 and limit == 4]
+            assert [step.terminated for step in steps] == [False] * 4 + [ends == 4]
+
+
+def test_no_episode_is_without_a_limit_of_steps(echo):
+    assert echo.describe()["time_limit"] == 100_000
+
+
 SENTENCES = {
     "raises": "step raises ArithmeticError: the physics has exploded",
     "hangs": "it hangs, no answer to step within 2 s",

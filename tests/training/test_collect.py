@@ -14,7 +14,6 @@ from small_agents import fit, forbes, write_config
 from forbes.data.episode_store import EpisodeStore
 from forbes.envs import EnvironmentProcess
 from forbes.evaluation.foresight import foretell, share_explained
-from forbes.files import replace_file
 from forbes.seeding import derive_seed
 from forbes.training import ImaginationActorCritic
 from forbes.training.acting import play_measured
@@ -226,17 +225,32 @@ def test_an_environment_that_hangs_ends_the_training_after_its_time(tmp_path, ca
     assert "Experience: timeout is 0" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("overlap", ["", ", overlap: true"])
+def test_an_agent_in_an_environment_that_never_ends_is_given_episodes_all_the_same(tmp_path, overlap, capsys):
+    config = write_config(tmp_path)
+    config.write_text(config.read_text().replace("seed_episodes: 2", f"seed_episodes: 2{overlap}"))
+    endless = ("--data.source.task", "Endless", "--data.source.options", "{}", "--data.source.time_limit")
+
+    assert fit("--config", config, *endless, 9, "--run_dir", tmp_path / "run") == 0
+
+    records = EpisodeStore(tmp_path / "run" / "episodes").records.values()
+    assert {(record.steps, record.terminated) for record in records} == {(9, False)}
+    assert fit("--config", config, *endless, 0, "--run_dir", tmp_path / "other") == 2
+    assert "Experience: time_limit is 0, expected at least 1 step" in capsys.readouterr().err
+
+
 def test_a_disk_that_is_full_ends_the_training_and_loses_nothing(run, tmp_path, monkeypatch, capsys):
-    def full(path, content):
-        if path.name == "000003.npz":
+    def full(descriptor, sync=os.fsync):
+        if "000003.npz" in os.readlink(f"/proc/self/fd/{descriptor}"):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace_file(path, content)
+        sync(descriptor)
 
     with monkeypatch.context() as patch:
-        patch.setattr("forbes.data.episode_store.replace_file", full)
+        patch.setattr(os, "fsync", full)
         assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run") == 2
 
-    assert "No space left on device" in capsys.readouterr().err.splitlines()[-1]
+    sentence = "000003.npz: cannot be written (No space left on device). Make room, or choose another place"
+    assert capsys.readouterr().err.splitlines()[-1].endswith(sentence)
     assert fit("--resume", tmp_path / "run") == 0
     pd.testing.assert_frame_equal(read_metrics(tmp_path / "run"), read_metrics(run), check_exact=True)
 

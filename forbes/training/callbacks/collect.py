@@ -15,6 +15,7 @@ from forbes.data.collection import random_policy
 from forbes.data.episodes import Episode
 from forbes.errors import ForbesError
 from forbes.evaluation.foresight import foretell, share_explained
+from forbes.files import require_room
 from forbes.seeding import derive_seed
 from forbes.training.acting import Acting, ActingModel, play_measured
 
@@ -66,6 +67,7 @@ class Collect(Callback):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open the store, before a checkpoint says how far it had come."""
         require_agent(self, trainer, pl_module)
+        self._estimated = False
         if stage == "fit":
             _experience(trainer).open(Path(trainer.default_root_dir) / "episodes")
 
@@ -91,10 +93,18 @@ class Collect(Callback):
             until = self.seed_episodes + trainer.current_epoch
             list(source.collect(until, Acting(agent, exploring=True), type(agent).__name__, agent.seed))
         _warn_of_ends(source, agent)
+        self._estimate_room(trainer)
         steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
         if source.newest.number >= self.seed_episodes:
             steps["return/exploring"] = source.newest.total_reward
         agent.log_dict(steps, on_step=False, on_epoch=True, batch_size=1)
+
+    def _estimate_room(self, trainer: Trainer) -> None:
+        """Warn where the disk will not hold the episodes to come, when the first epoch of this process begins."""
+        if not self._estimated and trainer.max_epochs not in (None, -1):
+            source, epochs = _experience(trainer), cast(int, trainer.max_epochs) - trainer.current_epoch
+            require_room(Path(trainer.default_root_dir), "the episodes to come", source.growth(epochs - 1))
+        self._estimated = True
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         """Let the next episode be played, now that other callbacks have played theirs."""
