@@ -102,7 +102,7 @@ class Collect(Callback):
     def _estimate_room(self, trainer: Trainer) -> None:
         """Warn where the disk will not hold the episodes to come, when the first epoch of this process begins."""
         if not self._estimated and trainer.max_epochs not in (None, -1):
-            source, epochs = _experience(trainer), cast(int, trainer.max_epochs) - trainer.current_epoch
+            source, epochs = _experience(trainer), trainer.max_epochs - trainer.current_epoch
             require_room(Path(trainer.default_root_dir), "the episodes to come", source.growth(epochs - 1))
         self._estimated = True
 
