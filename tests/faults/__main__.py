@@ -95,13 +95,19 @@ def _groups(folder: Path, options: argparse.Namespace) -> Iterator[Group]:
         )
     for scenario in (strokes, acting, overlapping, evaluation):
         place, whole = folder / f"without {scenario.name}", wholes[scenario].result
-        full = [functools.partial(resources.limited, scenario, whole, place / str(size), size) for size in SIZES]
         yield Group(
-            f"{scenario.name}: what cannot be written is one sentence, and nothing is lost",
-            f"no file above {', '.join(f'{size:,}' for size in SIZES)} bytes, as on a full disk; a folder that is "
-            "another user's",
-            [*full, functools.partial(resources.read_only, scenario, whole, place / "read-only")],
+            f"{scenario.name}: on a full disk it ends with one sentence, and nothing is lost",
+            f"no file above {', '.join(f'{size:,}' for size in SIZES)} bytes",
+            [functools.partial(resources.limited, scenario, whole, place / str(size), size) for size in SIZES],
         )
+    yield Group(
+        "a folder that may not be written is one sentence",
+        "a training and an evaluation in a folder of another user",
+        [
+            functools.partial(resources.read_only, each, wholes[each].result, folder / f"read-only {each.name}")
+            for each in (strokes, evaluation)
+        ],
+    )
     yield Group(
         "two at once do what one does, or one of them is refused",
         "two trainings, evaluations, comparisons in one folder",
