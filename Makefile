@@ -1,12 +1,12 @@
 # Everything works on a machine that has only Python >= 3.11, git and make: the first target called makes .venv.
 #   make fit [CONFIG=configs/strokes/forbes.yaml]   train, and draw the pictures
 #   make compare                                    FORBES against RSSM: two trainings, their scores, the paper's figures
-#   make test | lint | bench
+#   make test | lint | faults | bench
 PYTHON ?= python3
 CONFIG ?= configs/strokes/forbes.yaml
 BIN := .venv/bin
 
-.PHONY: fit compare test lint bench clean
+.PHONY: fit compare test lint faults bench clean
 .DELETE_ON_ERROR:
 
 fit: .venv/installed
@@ -24,6 +24,10 @@ lint: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# 20 minutes on 2 cores; writes what came of it.
+faults: .venv/installed-dev
+	PYTHONPATH=tests $(BIN)/python -m faults --report docs/reliability.md
 
 bench: .venv/installed-dev
 	set -e; for benchmark in benchmarks/*.py; do $(BIN)/python $$benchmark; done

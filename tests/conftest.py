@@ -4,12 +4,11 @@ import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
+from small_strokes import write_config, write_strokes
 
 from forbes.cli import main
-from forbes.data.stroke_file import StrokeArrays, save_strokes
 from forbes.training import configuration, loading
 from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
 
@@ -33,19 +32,7 @@ def no_module_is_allowed_by_another_test(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.fixture(scope="session")
 def strokes_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A stroke file of 40 training and 12 test digits of 5 to 9 random points."""
-    random = np.random.default_rng(0)
-    splits = {}
-    for split, digits in (("train", 40), ("test", 12)):
-        lengths = random.integers(5, 10, digits)
-        offsets = np.concatenate([[0], lengths.cumsum()]).astype(np.int32)
-        pen_up = np.zeros(offsets[-1], bool)
-        pen_up[offsets[1:] - 1] = True
-        points = random.integers(0, 28, (offsets[-1], 2), dtype=np.uint8)
-        labels = (np.arange(digits) % 10).astype(np.uint8)
-        splits[split] = StrokeArrays(points, pen_up, offsets, labels)
-    path = tmp_path_factory.mktemp("strokes") / "strokes.npz"
-    save_strokes(path, splits)
-    return path
+    return write_strokes(tmp_path_factory.mktemp("strokes") / "strokes.npz")
 
 
 @pytest.fixture(scope="session")
@@ -53,32 +40,7 @@ def tiny_config(strokes_file: Path, tmp_path_factory: pytest.TempPathFactory) ->
     """A configuration that trains FORBES for two epochs of five updates in a second."""
     path = tmp_path_factory.mktemp("project") / "configs" / "tiny" / "forbes.yaml"
     path.parent.mkdir(parents=True)
-    path.write_text(f"""\
-model:
-  class_path: WorldModel
-  init_args:
-    belief: {{class_path: FlowBelief, init_args: {{layers: 2, width: 4}}}}
-    encoder: {{class_path: MLPEncoder, init_args: {{width: 8, layers: 1}}}}
-    decoder: {{class_path: MLPDecoder, init_args: {{width: 8, layers: 1}}}}
-    likelihood: {{class_path: Bernoulli}}
-    state_dim: 2
-    hidden_dim: 4
-    mlp_dim: 8
-    mlp_layers: 1
-data:
-  class_path: SequenceDataModule
-  init_args:
-    source: {{class_path: Strokes, init_args: {{path: {strokes_file}, validation: 20}}}}
-    batch_size: 4
-    length: 6
-    updates_per_epoch: 5
-    validation_sequences: 20
-trainer:
-  accelerator: cpu
-  max_epochs: 2
-  log_every_n_steps: 1
-""")
-    return path
+    return write_config(path, strokes_file)
 
 
 @pytest.fixture(scope="session")

@@ -70,6 +70,8 @@ def _unknown_option(message: str, keys: list[str], option: str) -> tuple[str, st
         keys = [group[1], *keys]
     path = [*keys, *option.removesuffix(".class_path").split(".")]
     owners = re.findall(r"class_path[= ]'([\w.]+)'", message)
+    if owners and pydoc.locate(owners[-1]) is None:  # a short name, which jsonargparse took for one of the arguments
+        return ".".join(keys), f"{owners[-1]}: expected init_args beside class_path, found {option.split('.')[0]}"
     if owners:
         owner, valid = owners[-1].rpartition(".")[2], list(inspect.signature(pydoc.locate(owners[-1])).parameters)  # type: ignore[arg-type]
     elif path[0] == "trainer":
