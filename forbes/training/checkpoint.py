@@ -86,7 +86,7 @@ class AtomicCheckpointIO(CheckpointIO):
 
 
 class SaveLast(Checkpoint):
-    """Saves after each epoch; the checkpoint before becomes `previous.ckpt`.
+    """Saves after each epoch, whose metrics are logged before; the checkpoint before becomes `previous.ckpt`.
 
     Lightning's `ModelCheckpoint` remembers where it saved, and is lost in a run folder that was moved.
 
@@ -98,17 +98,30 @@ class SaveLast(Checkpoint):
         self.run = run
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save; every other callback has ended its epoch.
+        """Log the metrics of the epoch and save; every other callback has ended its epoch.
 
         Lightning counts an epoch that `max_steps` or `max_time` has cut short as done, and a resumed run would miss the
         rest of it. In the checkpoint it is not.
         """
+        _log_epoch(trainer)
         missing, epochs = int(not trainer.is_last_batch), cast(Any, trainer.fit_loop.epoch_progress)
         epochs.current.processed -= missing
         epochs.total.processed -= missing
         trainer.save_checkpoint(self.run.checkpoint)
         epochs.current.processed += missing
         epochs.total.processed += missing
+
+
+def _log_epoch(trainer: Trainer) -> None:
+    """Log what the epoch has measured, as Lightning does after the checkpoint, where a kill would lose it.
+
+    What is logged is forgotten, so that Lightning then has nothing to log.
+    """
+    loggers, loop = cast(Any, trainer)._logger_connector, trainer.fit_loop.epoch_loop
+    loggers.on_epoch_end()
+    loop._batches_that_stepped -= 1  # the index of the last update, as for its own metrics
+    loggers.update_train_epoch_metrics()
+    loop._batches_that_stepped += 1
 
 
 class ResumeWholeEpochs(Callback):

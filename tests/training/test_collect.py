@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from lightning import Trainer
 from small_agents import fit, forbes, write_config
 
 from forbes.data.episode_store import EpisodeStore
@@ -291,6 +292,33 @@ def test_a_killed_run_goes_on_to_the_same_numbers_and_the_same_episodes(run, tmp
         for ours, theirs in zip(*(store.episode(number)[:3] for store in stores), strict=True):
             np.testing.assert_array_equal(ours, theirs)
     assert any((other / "episodes" / "set_aside").iterdir())
+
+
+def test_a_kill_between_checkpoint_and_log_loses_no_line(run, tmp_path, monkeypatch):
+    """After the checkpoint of the second epoch, before Lightning logs what that epoch has measured."""
+    save_checkpoint = Trainer.save_checkpoint
+
+    def save_and_die(self, path, *args, **kwargs):
+        save_checkpoint(self, path, *args, **kwargs)
+        if self.global_step == 8:
+            raise Killed
+
+    other = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "save_checkpoint", save_and_die)
+        with pytest.raises(Killed):
+            fit("--config", write_config(tmp_path), "--run_dir", other)
+    assert read_checkpoint(RunFolder(other).checkpoint)["global_step"] == 8
+    assert fit("--resume", other) == 0
+
+    pd.testing.assert_frame_equal(read_metrics(other), read_metrics(run), check_exact=True)
+
+
+def test_no_line_of_the_log_is_written_twice(run):
+    lines = RunFolder(run).metrics.read_text().splitlines()
+
+    assert len(lines) == len(set(lines))
+    assert sum("env_steps" in line for line in lines) == 3  # one an epoch
 
 
 def test_a_resumed_run_learns_at_the_rates_it_is_given(run, tmp_path):
