@@ -7,7 +7,7 @@ from forbes.envs.base import Environment, Step
 from forbes.envs.control import DeepMindControl
 from forbes.envs.gymnasium import Gymnasium
 from forbes.envs.tasks import find_environment
-from forbes.envs.worker import BrokenEnvironmentError, EnvironmentProcess, belong_to_parent
+from forbes.envs.worker import BrokenEnvironmentError, EnvironmentProcess
 
 __all__ = [
     "BrokenEnvironmentError",
@@ -16,6 +16,5 @@ __all__ = [
     "EnvironmentProcess",
     "Gymnasium",
     "Step",
-    "belong_to_parent",
     "find_environment",
 ]

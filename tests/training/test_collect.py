@@ -13,6 +13,7 @@ from lightning import Trainer
 from small_agents import fit, forbes, write_config
 
 from forbes.data.episode_store import EpisodeStore
+from forbes.data.player import Player
 from forbes.envs import EnvironmentProcess
 from forbes.evaluation.foresight import foretell, share_explained
 from forbes.files import replace_file
@@ -385,6 +386,24 @@ def test_a_signal_ends_the_training_with_the_epoch_and_nothing_is_missing(
     pd.testing.assert_frame_equal(read_metrics(stopped), read_metrics(whole), check_exact=True)
     state, expected = (read_checkpoint(RunFolder(path).checkpoint)["state_dict"] for path in (stopped, whole))
     torch.testing.assert_close(state, expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_whole_group_while_the_player_starts_loses_nothing(tmp_path, monkeypatch, number):
+    """The player gets it before Python has begun there; `tests/envs/test_worker.py` has the same of an environment."""
+    start = Player._start
+
+    def start_and_send(self):
+        start(self)
+        os.kill(self._process.pid, number)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(Player, "_start", start_and_send)
+    (tmp_path / "agent.yaml").write_text(write_config(tmp_path).read_text().replace("{seed", "{overlap: true, seed"))
+
+    assert fit("--config", tmp_path / "agent.yaml", "--run_dir", tmp_path / "run") == 128 + number
+
+    assert read_checkpoint(RunFolder(tmp_path / "run").checkpoint)["global_step"] == 4
 
 
 def test_a_finished_run_can_be_made_longer(run, tmp_path):
