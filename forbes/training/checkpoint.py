@@ -2,11 +2,13 @@
 
 import hashlib
 import io
+import math
 import os
 import pickle
 import shutil
 import sys
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -61,13 +63,16 @@ class AtomicCheckpointIO(CheckpointIO):
         buffer = io.BytesIO()  # written to a full disk directly, torch.save fails without saying why
         torch.save(checkpoint, buffer)
 
-        def keep_the_one_before(written: Path) -> None:
+        def keep_others(written: Path) -> None:
             _verify(path, written.read_bytes())
-            if path.name == RunFolder.LAST and path.exists():
-                _keep_previous(path)
+            if path.name == RunFolder.LAST:
+                if SaveLast.is_best(checkpoint):
+                    _name_too(written, RunFolder.BEST)
+                if path.exists() and _is_whole(path):  # one that is not is worth less than the one before it
+                    _name_too(path, RunFolder.PREVIOUS)
 
         try:
-            replace_file(path, _sealed(buffer.getvalue()), keep_the_one_before)
+            replace_file(path, _sealed(buffer.getvalue()), keep_others)
         except OSError as error:
             raise ForbesError(
                 f"{path}: the checkpoint cannot be written ({error.strerror}), the one before it is untouched. "
@@ -88,6 +93,9 @@ class AtomicCheckpointIO(CheckpointIO):
 class SaveLast(Checkpoint):
     """Saves after each epoch, whose metrics are logged before; the checkpoint before becomes `previous.ckpt`.
 
+    The best one stays as `best.ckpt`: that with the highest `return/acting` of an agent, otherwise with the highest
+    bound of the validation, or its lowest loss. Of equals it is the first. A run that measures neither has none.
+
     Lightning's `ModelCheckpoint` remembers where it saved, and is lost in a run folder that was moved.
 
     Args:
@@ -96,6 +104,32 @@ class SaveLast(Checkpoint):
 
     def __init__(self, run: RunFolder) -> None:
         self.run = run
+        self._best: dict[str, Any] = {}  # metric, value and update
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint knows of the best one up to it."""
+        return self._best
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from there."""
+        self._best = state_dict
+
+    @classmethod
+    def is_best(cls, checkpoint: Mapping[str, Any]) -> bool:
+        """Tell whether a checkpoint is better than all before it."""
+        best = checkpoint.get("callbacks", {}).get(cls.__qualname__)
+        return best is not None and best["update"] == checkpoint["global_step"]
+
+    def _compare(self, trainer: Trainer, module: LightningModule) -> None:
+        """Note whether the checkpoint that follows is the best."""
+        metrics, objective = trainer.callback_metrics, getattr(module, "objective_name", "loss")
+        metric = "return/acting" if "return/acting" in metrics else f"val/{objective}"
+        value = float(metrics.get(metric, math.nan))
+        if not math.isfinite(value):
+            return
+        best = self._best["value"] if self._best.get("metric") == metric else None
+        if best is None or (value < best if objective == "loss" else value > best):
+            self._best = {"metric": metric, "value": value, "update": trainer.global_step}
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log the metrics of the epoch and save; every other callback has ended its epoch.
@@ -104,6 +138,7 @@ class SaveLast(Checkpoint):
         rest of it. In the checkpoint it is not.
         """
         _log_epoch(trainer)
+        self._compare(trainer, pl_module)
         missing, epochs = int(not trainer.is_last_batch), cast(Any, trainer.fit_loop.epoch_progress)
         epochs.current.processed -= missing
         epochs.total.processed -= missing
@@ -211,16 +246,20 @@ def _sealed(content: bytes) -> bytes:
     return begun + hashlib.sha256(begun).hexdigest().encode()
 
 
-def _keep_previous(path: Path) -> None:
-    """Keep the checkpoint that will be overwritten, unless it is damaged: then the one before it is worth more."""
+def _is_whole(path: Path) -> bool:
     try:
         _verify(path, path.read_bytes())
     except DamagedCheckpointError:
-        return
-    aside = path.with_name(f".{RunFolder.PREVIOUS}.part")
+        return False
+    return True
+
+
+def _name_too(path: Path, name: str) -> None:
+    """Give a file another name in its folder, in the place of the file that has it; a copy where links are unknown."""
+    aside = path.with_name(f".{name}.part")
     aside.unlink(missing_ok=True)
     try:
         os.link(path, aside)
     except OSError:  # a file system without hard links
         shutil.copyfile(path, aside)
-    aside.replace(path.with_name(RunFolder.PREVIOUS))
+    aside.replace(path.with_name(name))
