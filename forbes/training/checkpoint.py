@@ -8,7 +8,6 @@ import pickle
 import shutil
 import sys
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -66,7 +65,7 @@ class AtomicCheckpointIO(CheckpointIO):
         def keep_others(written: Path) -> None:
             _verify(path, written.read_bytes())
             if path.name == RunFolder.LAST:
-                if SaveLast.is_best(checkpoint):
+                if checkpoint.get("best", {}).get("update", -1) == checkpoint.get("global_step"):
                     _name_too(written, RunFolder.BEST)
                 if path.exists() and _is_whole(path):  # one that is not is worth less than the one before it
                     _name_too(path, RunFolder.PREVIOUS)
@@ -106,19 +105,13 @@ class SaveLast(Checkpoint):
         self.run = run
         self._best: dict[str, Any] = {}  # metric, value and update
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint knows of the best one up to it."""
-        return self._best
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Write into a checkpoint which is the best up to it; as state of a callback, other loops would ask for it."""
+        checkpoint["best"] = self._best
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from there."""
-        self._best = state_dict
-
-    @classmethod
-    def is_best(cls, checkpoint: Mapping[str, Any]) -> bool:
-        """Tell whether a checkpoint is better than all before it."""
-        best = checkpoint.get("callbacks", {}).get(cls.__qualname__)
-        return best is not None and best["update"] == checkpoint["global_step"]
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Go on from there; an older version did not write it."""
+        self._best = checkpoint.get("best", {})
 
     def _compare(self, trainer: Trainer, module: LightningModule) -> None:
         """Note whether the checkpoint that follows is the best."""

@@ -25,10 +25,11 @@ class RunFolder:
         metrics.jsonl      one JSON object a line: {"update": n, "epoch": e, name: value, ...}
         checkpoints/       last.ckpt; previous.ckpt, which is read where the last one is damaged; best.ckpt by the
                            validation bound or an agent's return
-        failure.pt         after a divergence: weights, batch and seed of the update whose loss is not finite
+        failure.pt         after a divergence: what repeats the update that is not finite (`forbes replay`)
         figures/
         evaluation.json    and evaluation.npz, what `forbes evaluate` has measured
         evaluation-best/   the same of another checkpoint, here checkpoints/best.ckpt
+        .lock              held by the process that trains here; .evaluation.lock by one that writes evaluation.json
 
     In config.yaml the `path` of the data is absolute, so that a run can be resumed and measured from any folder. The
     run folder itself may be moved, copied or read-only.

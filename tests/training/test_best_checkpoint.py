@@ -89,8 +89,7 @@ class Killed(BaseException):
 def test_a_kill_never_leaves_a_last_checkpoint_that_is_better_than_the_best(tmp_path, monkeypatch):
     path = tmp_path / "last.ckpt"
     for update in (1, 2):
-        best = {"metric": "val/elbo", "value": -1.0, "update": update}
-        checkpoint = {"global_step": update, "callbacks": {"SaveLast": best}}
+        checkpoint = {"global_step": update, "best": {"metric": "val/elbo", "value": -1.0, "update": update}}
         if update == 2:
             monkeypatch.setattr(Path, "replace", kill_at_last(Path.replace))
             with pytest.raises(Killed):
