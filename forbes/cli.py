@@ -29,6 +29,7 @@ COMMANDS = {
     "validate": Command("run the validation loop of a model", _TRAINED, "forbes.training.commands:validate"),
     "test": Command("run the test loop of a model", _TRAINED, "forbes.training.commands:test"),
     "predict": Command("run the prediction loop of a model", _TRAINED, "forbes.training.commands:predict"),
+    "replay": Command("show where a training has diverged", "RUN/failure.pt", "forbes.training.replay_command:main"),
     "evaluate": Command("measure trained models and compare them", "RUN RUN", "forbes.evaluation.commands:main"),
     "rollout": Command("film an agent", "RUN --video agent.gif", "forbes.figures.rollout_command:main"),
     "beliefs": Command("hold learned beliefs against exact ones", "RUN RUN", "forbes.evaluation.belief_command:main"),

@@ -8,7 +8,7 @@ import pytest
 FORBES = Path(__file__).parents[1] / "forbes"
 MODULES = sorted(FORBES.rglob("*.py"))
 
-FOUNDATION = {"errors", "files", "seeding", "arguments", "deferred", "frozen", "fusion", "named", "precision"}
+FOUNDATION = {"child", "errors", "files", "seeding", "arguments", "deferred", "frozen", "fusion", "named", "precision"}
 FOUNDATION |= {"parsers", "reading", "shapes"}
 BENEATH = {"beliefs", "data", "envs", "models", "control", "pomdps"}  # what training knows
 MAY_IMPORT = {  # besides itself and the foundation

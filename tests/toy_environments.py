@@ -1,9 +1,11 @@
 """Environments of a few lines, for what goes wrong and for what must come out; spawned processes import this module."""
 
+import gc
 import os
 import signal
 import sys
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +115,20 @@ class Unbuildable(Unready):
 
     def __init__(self):
         super().__init__("start", "raises")
+
+
+class Severed(Echo):
+    """Dies at a reset, when so many bytes of a longer answer are sent."""
+
+    def __init__(self, sent):
+        super().__init__()
+        self.sent = sent
+
+    def reset(self, seed):
+        if self.sent:
+            (pipe,) = (file for file in gc.get_objects() if isinstance(file, Connection) and not file.closed)
+            os.write(pipe.fileno(), (2 * self.sent).to_bytes(4, "big") + bytes(self.sent))
+        os._exit(7)
 
 
 class Hanging(Echo):

@@ -14,6 +14,7 @@ from forbes.errors import ForbesError
 from forbes.seeding import derive_seed
 
 __all__ = [
+    "ATTEMPTS",
     "MakePolicy",
     "Policy",
     "collect_episodes",
@@ -29,7 +30,8 @@ Policy: TypeAlias = Callable[[NDArray[Any]], NDArray[np.float32]]
 MakePolicy: TypeAlias = Callable[[Environment, int], Policy]
 """Makes the policy of an episode from the environment's numbers and a seed."""
 
-_ATTEMPTS = 3
+ATTEMPTS = 3
+"""How often an episode is begun before it is given up."""
 
 
 def random_policy(environment: Environment, seed: int) -> Policy:
@@ -103,7 +105,7 @@ def episode_seed(seed: int, number: int, purpose: str = "episode") -> int:
 
 
 def play_whole(
-    environment: Environment, make_policy: MakePolicy, seed: int, number: int, attempts: int = _ATTEMPTS
+    environment: Environment, make_policy: MakePolicy, seed: int, number: int, attempts: int = ATTEMPTS
 ) -> Episode:
     """Play an episode, and play it again where it breaks; `seed` and `number` are the episode's own.
 
@@ -115,7 +117,7 @@ def play_whole(
     except BrokenEnvironmentError as failure:
         if attempts == 1:
             raise ForbesError(
-                f"{failure}; so broke episode {number} {_ATTEMPTS} times, nothing of it is stored. Mend the environment"
+                f"{failure}; so broke episode {number} {ATTEMPTS} times, nothing of it is stored. Mend the environment"
             ) from failure
         print(f"forbes: {failure}; episode {number} is dropped and played again", file=sys.stderr)
     return play_whole(environment, make_policy, seed, number, attempts - 1)

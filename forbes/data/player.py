@@ -1,16 +1,18 @@
 """A process that plays episodes while this one trains."""
 
-import multiprocessing
+import atexit
 import pickle
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
 import torch
 
-from forbes.data.collection import MakePolicy, play_whole
+from forbes.child import start_child
+from forbes.data.collection import ATTEMPTS, MakePolicy, play_whole
 from forbes.data.episodes import Episode
-from forbes.envs import TIME_LIMIT, Environment, EnvironmentProcess, belong_to_parent
+from forbes.envs import TIME_LIMIT, Environment, EnvironmentProcess
 from forbes.errors import ForbesError
 
 __all__ = ["Player"]
@@ -19,8 +21,8 @@ __all__ = ["Player"]
 class Player:
     """Plays one episode at a time in a process of its own, on the CPU, with one thread.
 
-    The environment lives in a process below that one, as it does below this one without a player. Close it: it does
-    not end by itself.
+    The environment lives in a process below that one, as it does below this one without a player. A process that dies
+    is started again, and plays its episode again. Close it: it does not end before this process does.
 
     Args:
         make: makes the environment.
@@ -29,11 +31,9 @@ class Player:
     """
 
     def __init__(self, make: Callable[[], Environment], timeout: float = 60.0, time_limit: int = TIME_LIMIT) -> None:
-        spawn = multiprocessing.get_context("spawn")
-        self._connection, theirs = spawn.Pipe()
-        self._process = spawn.Process(target=_serve, args=(theirs, make, timeout, time_limit))
-        self._process.start()
-        theirs.close()  # so that the end of the process is the end of the pipe
+        self._arguments = make, timeout, time_limit
+        self._start()
+        atexit.register(self.close)  # multiprocessing would wait for it
 
     def begin(self, make_policy: MakePolicy, number: int, seed: int) -> None:
         """Let it play an episode by the policy as it is now.
@@ -43,39 +43,56 @@ class Player:
             number: of the episode, for messages.
             seed: of environment and policy.
         """
-        message = pickle.dumps((make_policy, number, seed))  # a pipe's own way to send tensors shares their memory
-        with suppress(OSError):  # it has died since the last episode; `finish` says so
-            self._connection.send_bytes(message)
+        self._number = number
+        self._message = pickle.dumps(
+            (make_policy, number, seed)
+        )  # a pipe's own way to send tensors shares their memory
+        self._ask()
 
-    def finish(self) -> Episode:
+    def finish(self, attempts: int = ATTEMPTS) -> Episode:
         """Wait for the episode.
 
         Raises:
-            ForbesError: where it broke three times, or the process has died.
+            ForbesError: where the episode broke, or the process died, three times.
         """
         try:
             answer = self._connection.recv()
-        except (EOFError, ConnectionError) as error:
+        except (EOFError, OSError) as error:
             self._process.join()
-            raise ForbesError(
-                f"the process that plays episodes has died, exit code {self._process.exitcode}; what it said is above. "
-                "Mend that, or set overlap to false"
-            ) from error
-        if isinstance(answer, ForbesError):
-            raise answer
-        episode: Episode = answer
-        return episode
+            died = f"the process that plays episodes has died, exit code {self._process.exitcode}"
+            if attempts == 1:
+                raise ForbesError(
+                    f"{died}, {ATTEMPTS} times in episode {self._number}; what it said is above. Mend that, or set "
+                    "overlap to false"
+                ) from error
+            print(f"forbes: {died}; episode {self._number} is played again", file=sys.stderr)
+        else:
+            if isinstance(answer, ForbesError):
+                raise answer
+            episode: Episode = answer
+            return episode
+        self._connection.close()
+        self._start()
+        self._ask()
+        return self.finish(attempts - 1)
 
     def close(self) -> None:
         """End the process, in the midst of an episode too."""
         self._process.kill()
         self._process.join()
         self._connection.close()
+        atexit.unregister(self.close)
+
+    def _start(self) -> None:
+        self._process, self._connection = start_child(_serve, *self._arguments)
+
+    def _ask(self) -> None:
+        with suppress(OSError):  # it has died since the last episode, which `finish` finds
+            self._connection.send_bytes(self._message)
 
 
 def _serve(connection: Connection, make: Callable[[], Environment], timeout: float, time_limit: int) -> None:
     """Run in the process: play what is asked for until the parent is gone."""
-    belong_to_parent()
     torch.set_num_threads(1)
     try:
         with EnvironmentProcess(make, timeout, time_limit) as environment:

@@ -7,7 +7,7 @@ from forbes.envs.base import TIME_LIMIT, Environment, Step
 from forbes.envs.control import DeepMindControl
 from forbes.envs.gymnasium import Gymnasium
 from forbes.envs.tasks import find_environment
-from forbes.envs.worker import BrokenEnvironmentError, EnvironmentProcess, belong_to_parent
+from forbes.envs.worker import BrokenEnvironmentError, EnvironmentProcess
 
 __all__ = [
     "TIME_LIMIT",
@@ -17,6 +17,5 @@ __all__ = [
     "EnvironmentProcess",
     "Gymnasium",
     "Step",
-    "belong_to_parent",
     "find_environment",
 ]

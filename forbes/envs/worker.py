@@ -1,30 +1,29 @@
 """A process that owns an environment, so that a simulator that hangs, dies or raises takes nothing with it.
 
-The process is spawned, never forked: OpenGL contexts do not survive a fork, and a renderer in the process that trains
-on a GPU can hang it. Numbers travel as numpy, and torch is not imported there unless the environment does it.
+A renderer in the process that trains on a GPU can hang it. Numbers travel as numpy, and torch is not imported there
+unless the environment does it.
 """
 
 import atexit
 import io
-import multiprocessing
 import os
 import pickle
-import signal
 import sys
-import threading
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from types import FunctionType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from forbes.child import start_child
 from forbes.envs.base import TIME_LIMIT, Environment, Step, check_environment, check_step
 from forbes.errors import ForbesError
 
-__all__ = ["BrokenEnvironmentError", "EnvironmentProcess", "belong_to_parent"]
+__all__ = ["BrokenEnvironmentError", "EnvironmentProcess"]
 
 START_LIMIT = 180.0
 """Seconds to import and build an environment; two tries of a renderer, of 60 each, among them."""
@@ -75,7 +74,7 @@ class EnvironmentProcess(Environment):
     def __init__(self, make: Callable[[], Environment], timeout: float = 60.0, time_limit: int = TIME_LIMIT) -> None:
         _require_importable(make)
         self.make, self._timeout, self._time_limit = make, timeout, time_limit
-        self._process: multiprocessing.process.BaseProcess | None = None
+        self._process: BaseProcess | None = None
         self._start()
 
     def reset(self, seed: int) -> Step:
@@ -121,12 +120,8 @@ class EnvironmentProcess(Environment):
         return str(self._description["task"] if built else getattr(self.make, "func", self.make).__name__)
 
     def _start(self) -> None:
-        spawn = multiprocessing.get_context("spawn")
-        self._connection, theirs = spawn.Pipe()
-        self._process = spawn.Process(target=_serve, args=(theirs, self.make), daemon=True)
-        self._process.start()
-        atexit.register(self.close)  # multiprocessing would ask it to end, which it leaves to its parent, and wait
-        theirs.close()  # so that the end of the process is the end of the pipe
+        self._process, self._connection = start_child(_serve, self.make)
+        atexit.register(self.close)  # multiprocessing would wait for it
         facts: _Facts = self._receive("start", START_LIMIT)
         self.observation_shape, self.action_dim, self.discrete, self.action_repeat, self._description = facts
 
@@ -152,7 +147,7 @@ class EnvironmentProcess(Environment):
             if not self._connection.poll(timeout):
                 raise BrokenEnvironmentError(f"{self._name}: it hangs, no answer to {method} within {timeout:g} s")
             answer = self._connection.recv()
-        except (EOFError, ConnectionError) as error:
+        except (EOFError, OSError) as error:  # before an answer, or within one
             self._process.join(timeout)
             status = self._process.exitcode
             raise BrokenEnvironmentError(
@@ -197,7 +192,6 @@ def _require_importable(make: Callable[[], Environment]) -> None:
 
 def _serve(connection: Connection, make: Callable[[], Environment]) -> None:
     """Run in the process: build the environment and answer until the parent is gone or something is wrong."""
-    belong_to_parent()
     try:
         environment = make()
         check_environment(environment)
@@ -215,18 +209,3 @@ def _serve(connection: Connection, make: Callable[[], Environment]) -> None:
         refused = isinstance(error, ForbesError)
         sentence = str(error) if refused else f"{type(error).__name__}: {error}"
         connection.send(_Report(" ".join(sentence.split()), traceback.format_exc(), refused))
-
-
-def belong_to_parent() -> None:
-    """Leave signals to the parent of this process, which gets those to the group too, and end when it ends."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_follow_parent, daemon=True).start()
-
-
-def _follow_parent() -> None:
-    """End with the parent, also from within a step that never returns."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)

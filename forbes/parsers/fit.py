@@ -62,4 +62,10 @@ def run_options() -> argparse.ArgumentParser:
     group.add_argument(
         "--resume", metavar="RUN", help="go on with this run, from its last checkpoint with its config.yaml; flags win"
     )
+    parser.add_argument_group("where a loss or gradient is not finite").add_argument(
+        "--on-divergence",
+        choices=("stop", "lower-rate"),
+        default="stop",
+        help="stop with exit status 3 (default), or go back one checkpoint and on with half the rates, three times",
+    )
     return parser

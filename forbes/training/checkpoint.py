@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import math
 import os
 import pickle
 import shutil
@@ -61,12 +62,15 @@ class AtomicCheckpointIO(CheckpointIO):
         buffer = io.BytesIO()  # written to a full disk directly, torch.save fails without saying why
         torch.save(checkpoint, buffer)
 
-        def keep_the_one_before(written: Path) -> None:
+        def keep_others(written: Path) -> None:
             _verify(path, written.read_bytes())
-            if path.name == RunFolder.LAST and path.exists():
-                _keep_previous(path)
+            if path.name == RunFolder.LAST:
+                if checkpoint.get("best", {}).get("update", -1) == checkpoint.get("global_step"):
+                    _name_too(written, RunFolder.BEST)
+                if path.exists() and _is_whole(path):  # one that is not is worth less than the one before it
+                    _name_too(path, RunFolder.PREVIOUS)
 
-        replace_file(path, _sealed(buffer.getvalue()), keep_the_one_before)
+        replace_file(path, _sealed(buffer.getvalue()), keep_others)
 
     def load_checkpoint(
         self, path: str | os.PathLike[str], map_location: Any | None = None, weights_only: bool | None = None
@@ -80,7 +84,10 @@ class AtomicCheckpointIO(CheckpointIO):
 
 
 class SaveLast(Checkpoint):
-    """Saves after each epoch; the checkpoint before becomes `previous.ckpt`.
+    """Saves after each epoch, whose metrics are logged before; the checkpoint before becomes `previous.ckpt`.
+
+    The best one stays as `best.ckpt`: that with the highest `return/acting` of an agent, otherwise with the highest
+    bound of the validation, or its lowest loss. Of equals it is the first. A run that measures neither has none.
 
     Lightning's `ModelCheckpoint` remembers where it saved, and is lost in a run folder that was moved.
 
@@ -90,29 +97,63 @@ class SaveLast(Checkpoint):
 
     def __init__(self, run: RunFolder) -> None:
         self.run = run
+        self._best: dict[str, Any] = {}  # metric, value and update
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Write into a checkpoint which is the best up to it; as state of a callback, other loops would ask for it."""
+        checkpoint["best"] = self._best
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Go on from there; an older version did not write it."""
+        self._best = checkpoint.get("best", {})
+
+    def _compare(self, trainer: Trainer, module: LightningModule) -> None:
+        """Note whether the checkpoint that follows is the best."""
+        metrics, objective = trainer.callback_metrics, getattr(module, "objective_name", "loss")
+        metric = "return/acting" if "return/acting" in metrics else f"val/{objective}"
+        value = float(metrics.get(metric, math.nan))
+        if not math.isfinite(value):
+            return
+        best = self._best["value"] if self._best.get("metric") == metric else None
+        if best is None or (value < best if objective == "loss" else value > best):
+            self._best = {"metric": metric, "value": value, "update": trainer.global_step}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Estimate the room: weights and Adam's two moments, of the last checkpoint, the one before and a new one.
+        """Estimate the room: weights and Adam's two moments, of the last, the previous, the best and a new checkpoint.
 
         Raises:
             ForbesError: where not even the weights fit once.
         """
         weights = sum(values.numel() * values.element_size() for values in pl_module.state_dict().values())
-        missing = 3 - len([*self.run.checkpoint.parent.glob("*.ckpt")])
+        missing = 4 - len([*self.run.checkpoint.parent.glob("*.ckpt")])
         require_room(self.run.path, "checkpoints", likely=3 * weights * max(missing, 1), least=weights)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save; every other callback has ended its epoch.
+        """Log the metrics of the epoch and save; every other callback has ended its epoch.
 
         Lightning counts an epoch that `max_steps` or `max_time` has cut short as done, and a resumed run would miss the
         rest of it. In the checkpoint it is not.
         """
+        _log_epoch(trainer)
+        self._compare(trainer, pl_module)
         missing, epochs = int(not trainer.is_last_batch), cast(Any, trainer.fit_loop.epoch_progress)
         epochs.current.processed -= missing
         epochs.total.processed -= missing
         trainer.save_checkpoint(self.run.checkpoint)
         epochs.current.processed += missing
         epochs.total.processed += missing
+
+
+def _log_epoch(trainer: Trainer) -> None:
+    """Log what the epoch has measured, as Lightning does after the checkpoint, where a kill would lose it.
+
+    What is logged is forgotten, so that Lightning then has nothing to log.
+    """
+    loggers, loop = cast(Any, trainer)._logger_connector, trainer.fit_loop.epoch_loop
+    loggers.on_epoch_end()
+    loop._batches_that_stepped -= 1  # the index of the last update, as for its own metrics
+    loggers.update_train_epoch_metrics()
+    loop._batches_that_stepped += 1
 
 
 class ResumeWholeEpochs(Callback):
@@ -202,16 +243,20 @@ def _sealed(content: bytes) -> bytes:
     return begun + hashlib.sha256(begun).hexdigest().encode()
 
 
-def _keep_previous(path: Path) -> None:
-    """Keep the checkpoint that will be overwritten, unless it is damaged: then the one before it is worth more."""
+def _is_whole(path: Path) -> bool:
     try:
         _verify(path, path.read_bytes())
     except DamagedCheckpointError:
-        return
-    aside = path.with_name(f".{RunFolder.PREVIOUS}.part")
+        return False
+    return True
+
+
+def _name_too(path: Path, name: str) -> None:
+    """Give a file another name in its folder, in the place of the file that has it; a copy where links are unknown."""
+    aside = path.with_name(f".{name}.part")
     aside.unlink(missing_ok=True)
     try:
         os.link(path, aside)
     except OSError:  # a file system without hard links
         shutil.copyfile(path, aside)
-    aside.replace(path.with_name(RunFolder.PREVIOUS))
+    aside.replace(path.with_name(name))

@@ -35,8 +35,9 @@ from forbes.training.configuration import (
     data_paths,
     require_classes,
 )
-from forbes.training.divergence import StopAtDivergence
+from forbes.training.divergence import DivergedError, StopAtDivergence
 from forbes.training.loading import check_weights, weights_of
+from forbes.training.lower_rate import MOST, LowerRateError, at_half_the_rate
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
 from forbes.training.provenance import RecordRun, read_provenance
@@ -62,7 +63,15 @@ _NOT_OURS = (  # warnings that say nothing true or useful here
 
 def fit(arguments: Sequence[str]) -> int:
     """Train a model and give the exit status."""
-    return _run("fit", arguments)
+    lowered = 0
+    while True:
+        try:
+            return _run("fit", arguments)
+        except LowerRateError as error:
+            if lowered == MOST:
+                raise
+            lowered, arguments = lowered + 1, at_half_the_rate(error)
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # of no training, until the next has begun
 
 
 def validate(arguments: Sequence[str]) -> int:
@@ -244,6 +253,10 @@ class _Experiment(LightningCLI):
             how["verbose"] = False  # Lightning's table would leave out what is in brackets
         try:
             found = getattr(self.trainer, self.command)(self.model, **how)
+        except DivergedError as error:
+            if self.options.on_divergence == "stop" or self.stop is None or self.stop.received is not None:
+                raise
+            raise LowerRateError(error, self.stop.run) from error
         except SIGTERMException:
             if self.stop is None:
                 return 128 + signal.SIGTERM

@@ -1,6 +1,5 @@
 """Divergence: a training stops before the first update that is not finite, and keeps all that was finite before."""
 
-import io
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -13,16 +12,25 @@ from torch.optim import Optimizer
 
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
-from forbes.files import replace_file
+from forbes.training.checkpoint import AtomicCheckpointIO
 from forbes.training.run_folder import RunFolder
 
 __all__ = ["DivergedError", "StopAtDivergence", "hold_unless_finite"]
 
 
 class DivergedError(ForbesError):
-    """A loss, a gradient or a parameter is not finite."""
+    """A loss, a gradient or a parameter is not finite.
+
+    Args:
+        message: one sentence.
+        update: that is not, counted from 1.
+    """
 
     exit_status = 3
+
+    def __init__(self, message: str, update: int) -> None:
+        super().__init__(message)
+        self.update = update
 
 
 def hold_unless_finite(optimizer: Optimizer, value: Tensor, update: int) -> None:
@@ -46,7 +54,7 @@ class StopAtDivergence(Callback):
 
     On a CPU that is right after the update; on a GPU once in each interval of the logger, which waits for the device
     anyway, and before each checkpoint. `failure.pt` in the run folder has what repeats the update: the weights and the
-    optimiser before it, its batches, and the seed of its noise.
+    optimiser before it, its batches, and the seed of its noise (`forbes replay`).
 
     Args:
         run: where `failure.pt` goes.
@@ -82,7 +90,8 @@ class StopAtDivergence(Callback):
             if not parameter.isfinite().all():
                 raise DivergedError(
                     f"{self.run}: {name} is not finite after update {trainer.global_step}, so no checkpoint is "
-                    "written; the one before it is untouched. Go on from there with a lower learning rate"
+                    "written; the one before it is untouched. Go on from there with a lower learning rate",
+                    trainer.global_step,
                 )
 
     def _stop_if_held(self, trainer: Trainer, module: LightningModule) -> None:
@@ -90,27 +99,36 @@ class StopAtDivergence(Callback):
         if math.isinf(held):
             return
         update = int(held)
-        content = io.BytesIO()
-        torch.save(_what_repeats(trainer, module, update), content)
-        replace_file(self.run.failure, content.getvalue())
+        AtomicCheckpointIO().save_checkpoint(_what_repeats(trainer, module, update), self.run.failure)
         there = f"forbes fit --resume {self.run}" if self.run.checkpoint.exists() else "the same command"
         raise DivergedError(
-            f"{self.run}: diverged, the loss or gradient of update {update + 1} is not finite. {self.run.failure.name} "
-            f"repeats it. Give a lower --model.learning_rate to {there}"
+            f"{self.run}: diverged, the loss or gradient of update {update + 1} is not finite. See where: "
+            f"forbes replay {self.run.failure}. Give a lower --model.learning_rate to {there}",
+            update + 1,
         )
 
 
 def _what_repeats(trainer: Trainer, module: LightningModule, update: int) -> dict[str, Any]:
     """Return plain values and tensors from which an update can be computed again; the weights are those before it."""
     data: SequenceDataModule = trainer.datamodule  # type: ignore[attr-defined]
-    each = trainer.accumulate_grad_batches
-    numbers: Sequence[int] = range(update * each, (update + 1) * each)
+    numbers = _batches_of(update, int(trainer.num_training_batches), trainer.accumulate_grad_batches)
+    drawn: Sequence[int] = numbers
     if trainer.overfit_batches:  # type: ignore[attr-defined]  # all epochs share theirs
-        numbers = [number % int(trainer.num_training_batches) for number in numbers]
+        drawn = [number % int(trainer.num_training_batches) for number in numbers]
     return {
         "update": update,
         "seed": getattr(module, "seed", None),
+        "device": module.device.type,
+        "precision": trainer.precision,
         "state_dict": module.state_dict(),
         "optimizer_states": [optimizer.state_dict() for optimizer in trainer.optimizers],
-        "batches": [data.sequences("train", data.train_index(number))._asdict() for number in numbers],
+        "batch_numbers": [*numbers],
+        "batches": [data.sequences("train", data.train_index(number))._asdict() for number in drawn],
     }
+
+
+def _batches_of(update: int, an_epoch: int, an_update: int) -> range:
+    """Return the numbers of the batches of an update; the last update of an epoch may have fewer than the others."""
+    epoch, place = divmod(update, -(-an_epoch // an_update))
+    first = place * an_update
+    return range(epoch * an_epoch + first, epoch * an_epoch + min(first + an_update, an_epoch))

@@ -27,7 +27,8 @@ from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder, read_config
 from forbes.training.world_model import WorldModel
 
-__all__ = ["LoadedRun", "check_weights", "load_known_belief", "load_run", "loaded_agent", "open_run", "weights_of"]
+__all__ = ["LoadedRun", "build_run", "check_weights", "load_known_belief", "load_run", "loaded_agent", "open_run"]
+__all__ += ["weights_of"]
 
 Module = TypeVar("Module", bound=LightningModule)
 
@@ -72,6 +73,21 @@ def _load(run: Path | str, kind: type[Module], other: str) -> LoadedRun[Module]:
     folder = RunFolder.trained(run)
     checkpoint = open_checkpoint(folder.checkpoint)
     state = weights_of(checkpoint.content, str(folder.checkpoint))
+    module, data, config = build_run(folder)
+    if not isinstance(module, kind):
+        found = type(module).__name__
+        raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Measure it with: {other} {run}")
+    check_weights(module, state, str(folder.checkpoint))
+    module.load_state_dict(state)
+    return LoadedRun(module.eval(), data, config, checkpoint.sha256)
+
+
+def build_run(folder: RunFolder) -> tuple[LightningModule, SequenceDataModule, dict[str, Any]]:
+    """Build the module and the data of a run's config.yaml, and return them with it; the weights are untrained.
+
+    Raises:
+        ForbesError: where the configuration cannot be built, or its data are not there.
+    """
     config = read_config(folder.config)
     for key, value in changed_defaults(config).items():
         _put(config, key, value)
@@ -93,12 +109,7 @@ def _load(run: Path | str, kind: type[Module], other: str) -> LoadedRun[Module]:
             raise ForbesError(f"{folder.config}: {name} is {path}, which is not there. Set it to where the data are")
     with building(str(folder.config)):
         built = parser.instantiate(parsed, instantiators=[(partial(_recalled, folder.path), Experience, True)])
-    if not isinstance(built.model, kind):
-        found = type(built.model).__name__
-        raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Measure it with: {other} {run}")
-    check_weights(built.model, state, str(folder.checkpoint))
-    built.model.load_state_dict(state)
-    return LoadedRun(built.model.eval(), built.data, config, checkpoint.sha256)
+    return built.model, built.data, config
 
 
 def _recalled(run: Path, kind: type[Experience], **arguments: Any) -> Experience:

@@ -23,11 +23,13 @@ class RunFolder:
         config.yaml        the whole configuration, defaults included
         provenance.json    what was run, when, by which versions, on what data: one entry for each start
         metrics.jsonl      one JSON object a line: {"update": n, "epoch": e, name: value, ...}
-        checkpoints/       last.ckpt, and previous.ckpt, which is read where the last one is damaged
-        failure.pt         after a divergence: weights, batch and seed of the update whose loss is not finite
+        checkpoints/       last.ckpt; previous.ckpt, which is read where the last one is damaged; best.ckpt by the
+                           validation bound or an agent's return
+        failure.pt         after a divergence: what repeats the update that is not finite (`forbes replay`)
         figures/
         evaluation.json    and evaluation.npz, what `forbes evaluate` has measured
         evaluation-best/   the same of another checkpoint, here checkpoints/best.ckpt
+        .lock              held by the process that trains here; .evaluation.lock by one that writes evaluation.json
 
     In config.yaml the `path` of the data is absolute, so that a run can be resumed and measured from any folder. The
     run folder itself may be moved, copied or read-only.
@@ -37,7 +39,7 @@ class RunFolder:
             instead of the last one.
     """
 
-    LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
+    LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 
     def __init__(self, path: Path | str) -> None:
         path = Path(path)

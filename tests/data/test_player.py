@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from contextlib import closing
@@ -78,16 +79,69 @@ class Kills(Said):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_a_player_that_dies_is_named():
-    """In an episode, or between two."""
-    died = "the process that plays episodes has died, exit code -9"
+def test_a_player_that_dies_each_time_is_named():
     with closing(Player(partial(Parrot, steps=8))) as player:
-        player.begin(Kills(0.5), number=0, seed=0)
-        with pytest.raises(ForbesError, match=died):
+        player.begin(Kills(0.5), number=4, seed=0)
+        with pytest.raises(ForbesError, match="has died, exit code -9, 3 times in episode 4; what it said is above"):
             player.finish()
-        player.begin(Said(0.5), number=1, seed=1)
-        with pytest.raises(ForbesError, match=died):
-            player.finish()
+
+
+def test_a_killed_player_is_started_again_and_plays_the_same_episode(capfd):
+    """Killed between two episodes."""
+    with closing(Player(partial(Parrot, steps=8))) as player:
+        os.kill(player._process.pid, signal.SIGKILL)
+        player._process.join()
+        player.begin(Said(0.5), number=4, seed=3)
+        for ours, theirs in zip(player.finish(), play(Parrot(8), Said(0.5)(None, 3), 3), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+    assert "has died, exit code -9; episode 4 is played again" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_a_player_that_starts_is_left_to_its_parent(number, capfd):
+    """As a terminal sends it to the whole group: before Python has begun in the new process."""
+    with closing(Player(partial(Parrot, steps=8))) as player:
+        os.kill(player._process.pid, number)
+        player.begin(Said(0.5), number=0, seed=3)
+        assert len(player.finish().action) == 9
+
+    assert capfd.readouterr().err == ""
+
+
+class SlowToImport:
+    """Makes an environment, in a process that imports what it needs for an hour."""
+
+    def __reduce__(self):
+        return time.sleep, (3600,)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+@pytest.mark.parametrize("kind", ["forbes.data.player.Player", "forbes.envs.EnvironmentProcess"])
+def test_a_process_that_still_imports_ends_with_its_parent(tmp_path, kind):
+    module, _, name = kind.rpartition(".")
+    program = f"""
+import multiprocessing, threading, time
+from {module} import {name}
+from test_player import SlowToImport
+if __name__ == "__main__":
+    threading.Thread(target={name}, args=(SlowToImport(),), daemon=True).start()
+    while not (children := multiprocessing.active_children()):
+        time.sleep(0.01)
+    time.sleep(2)
+    print(children[0].pid, flush=True)
+    time.sleep(3600)
+"""
+    (tmp_path / "parent.py").write_text(program)
+    paths = os.pathsep.join([os.path.dirname(__file__), *filter(None, sys.path)])
+    command, environ = [sys.executable, str(tmp_path / "parent.py")], os.environ | {"PYTHONPATH": paths}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environ) as parent:
+        child = int(parent.stdout.readline())
+        parent.kill()
+
+    if not (ended := ends(child)):
+        os.kill(child, signal.SIGKILL)
+    assert ended
 
 
 class Told(Said):

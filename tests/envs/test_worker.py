@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 import pytest
 from processes import ends
-from toy_environments import Echo, Troubled, Unready
+from toy_environments import Echo, Severed, Troubled, Unready
 
 from forbes.envs import BrokenEnvironmentError, EnvironmentProcess, find_environment, worker
 from forbes.errors import ForbesError
@@ -114,6 +114,27 @@ def test_an_interrupt_leaves_no_answer_behind_that_is_taken_for_another(echo, mo
             echo.step(ACTIONS[0])
 
     assert_same(episode(echo), episode(Echo()))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_a_process_that_starts_is_left_to_its_parent(number, monkeypatch):
+    answer = EnvironmentProcess._answer
+
+    def send(self, method, timeout):
+        os.kill(self._process.pid, number)
+        return answer(self, method, timeout)
+
+    monkeypatch.setattr(EnvironmentProcess, "_answer", send)
+    with EnvironmentProcess(Echo) as environment:
+        assert_same(episode(environment), episode(Echo()))
+
+
+@pytest.mark.parametrize("sent", [0, 100])
+def test_a_process_that_dies_before_or_within_its_answer_has_died(sent, tmp_path):
+    """A connection tells the two apart: by an EOFError and an OSError."""
+    with EnvironmentProcess(partial(Severed, sent)) as environment:
+        with pytest.raises(BrokenEnvironmentError, match="Echo: its process has died in reset, exit code 7"):
+            environment.reset(0)
 
 
 def test_an_error_that_a_user_can_mend_is_not_tried_again():

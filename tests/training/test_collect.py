@@ -9,9 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from lightning import Trainer
 from small_agents import fit, forbes, write_config
 
 from forbes.data.episode_store import EpisodeStore
+from forbes.data.player import Player
 from forbes.envs import EnvironmentProcess
 from forbes.evaluation.foresight import foretell, share_explained
 from forbes.seeding import derive_seed
@@ -307,6 +309,33 @@ def test_a_killed_run_goes_on_to_the_same_numbers_and_the_same_episodes(run, tmp
     assert any((other / "episodes" / "set_aside").iterdir())
 
 
+def test_a_kill_between_checkpoint_and_log_loses_no_line(run, tmp_path, monkeypatch):
+    """After the checkpoint of the second epoch, before Lightning logs what that epoch has measured."""
+    save_checkpoint = Trainer.save_checkpoint
+
+    def save_and_die(self, path, *args, **kwargs):
+        save_checkpoint(self, path, *args, **kwargs)
+        if self.global_step == 8:
+            raise Killed
+
+    other = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "save_checkpoint", save_and_die)
+        with pytest.raises(Killed):
+            fit("--config", write_config(tmp_path), "--run_dir", other)
+    assert read_checkpoint(RunFolder(other).checkpoint)["global_step"] == 8
+    assert fit("--resume", other) == 0
+
+    pd.testing.assert_frame_equal(read_metrics(other), read_metrics(run), check_exact=True)
+
+
+def test_no_line_of_the_log_is_written_twice(run):
+    lines = RunFolder(run).metrics.read_text().splitlines()
+
+    assert len(lines) == len(set(lines))
+    assert sum("env_steps" in line for line in lines) == 3  # one an epoch
+
+
 def test_a_resumed_run_learns_at_the_rates_it_is_given(run, tmp_path):
     """At rates of 0 it stays what it was."""
     other = shutil.copytree(run, tmp_path / "run")
@@ -371,6 +400,24 @@ def test_a_signal_ends_the_training_with_the_epoch_and_nothing_is_missing(
     pd.testing.assert_frame_equal(read_metrics(stopped), read_metrics(whole), check_exact=True)
     state, expected = (read_checkpoint(RunFolder(path).checkpoint)["state_dict"] for path in (stopped, whole))
     torch.testing.assert_close(state, expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_whole_group_while_the_player_starts_loses_nothing(tmp_path, monkeypatch, number):
+    """The player gets it before Python has begun there; `tests/envs/test_worker.py` has the same of an environment."""
+    start = Player._start
+
+    def start_and_send(self):
+        start(self)
+        os.kill(self._process.pid, number)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(Player, "_start", start_and_send)
+    (tmp_path / "agent.yaml").write_text(write_config(tmp_path).read_text().replace("{seed", "{overlap: true, seed"))
+
+    assert fit("--config", tmp_path / "agent.yaml", "--run_dir", tmp_path / "run") == 128 + number
+
+    assert read_checkpoint(RunFolder(tmp_path / "run").checkpoint)["global_step"] == 4
 
 
 def test_a_finished_run_can_be_made_longer(run, tmp_path):
