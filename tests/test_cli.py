@@ -171,8 +171,8 @@ def error_of(capsys, *arguments):
         (["--exploration", "0"], "did you mean model.exploration?"),
         (["mine.yaml"], "mine.yaml: a configuration needs its flag. Say: --config mine.yaml"),
         (
-            ["--trainer.logger", "TensorBoardLogger"],
-            "trainer.logger: save_dir missing, give it the run folder: --run_dir DIR --trainer.logger.save_dir DIR",
+            ["--trainer.logger", "TensorBoardLogger", "--trainer.logger.savedir", "logs"],
+            "trainer.logger.savedir: TensorBoardLogger has no such option, did you mean save_dir?",
         ),
         (["--trainer.callbacks", "ModelCheckpoint", "--trainer.callbacks.save_top_k", "-3"], "save_top_k=-3"),
         (["--model.belief", "FlowBelef"], "no class FlowBelef that fits here, did you mean FlowBelief?"),
