@@ -8,7 +8,13 @@ from forbes.arguments import ArgumentParser, Split, positive
 
 __all__ = ["PASSES", "SUBSET", "add_acting_samples", "add_output", "add_score_options", "parser"]
 
-PASSES = ("elbo", "pll", "fivo", "open-loop")
+PASSES = {
+    "elbo": "samples",
+    "pll": "particles",
+    "fivo": "particles",
+    "open-loop": "futures",
+}
+"""What --scores may name, with the option that has its number of samples."""
 SUBSET = 1000
 """Sequences that particles are spent on, unless --sequences says otherwise."""
 
