@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import pytest
 
-from forbes.cli import main
 from forbes.data.episode_store import EpisodeStore
 from forbes.evaluation.record import read_record
 from forbes.parsers import compare
@@ -137,15 +136,3 @@ def test_a_place_that_is_not_there_is_no_edit(tmp_path):
             apply(f"@@ a.py\n{place}\n+more\n", tmp_path)
 
     assert (tmp_path / "a.py").read_text() == "one\nhalf\ntwo\ntwo\n"
-
-
-def test_the_environment_of_the_documentation_is_collected(in_tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(in_tmp_path))  # a process begins in the folder of the tests
-    text = (ROOT / "docs/environments.md").read_text()
-    Path("my_room.py").write_text(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1])
-    command = re.search(r"    forbes (data collect --allow-module my_room .*)", text)[1]
-
-    assert main(command.replace("--episodes 10", "--episodes 1").split()) == 0
-
-    assert len(EpisodeStore("episodes/room").records) == 1
-    del sys.modules["my_room"]

@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
+from forbes.arguments import LONGEST
 from forbes.data.collection import MakePolicy, collect_episodes, describe_environment, episode_seed
 from forbes.data.episode_store import EpisodeStore, EpisodeWriter, first_held
 from forbes.data.episodes import EpisodeRecord
@@ -38,8 +39,10 @@ class Experience(SequenceSource):
     def __init__(
         self, task: str, options: dict[str, Any] | None = None, capacity: int | None = None, timeout: float = 60.0
     ) -> None:
-        if not timeout > 0:
-            raise ForbesError(f"Experience: timeout is {timeout}, expected seconds above 0. Choose another")
+        if not 0 < timeout <= LONGEST:
+            raise ForbesError(
+                f"Experience: timeout is {timeout}, expected seconds above 0, at most {LONGEST}. Choose another"
+            )
         self.task, self.options, self.capacity, self.timeout = task, options or {}, capacity, timeout
         self._make = find_environment(task, **self.options)
         self._writer: EpisodeWriter | None = None

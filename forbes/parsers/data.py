@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import get_args
 
-from forbes.arguments import Dataset, Fetched, Origin, Split, positive
+from forbes.arguments import ArgumentParser, Dataset, Fetched, Origin, Split, positive, seconds
 from forbes.envs.tasks import TASKS
 
 __all__ = ["main", "parser"]
@@ -31,17 +31,12 @@ def parser() -> argparse.ArgumentParser:
     return of_data
 
 
-class _Parser(argparse.ArgumentParser):
+class _Parser(ArgumentParser):
     """Has a command under each of its names."""
 
     def __init__(self) -> None:
-        super().__init__(
-            prog="forbes data",
-            description="Build, fetch, compare, collect and look at the data.",
-            epilog="examples:",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        self._commands = self.add_subparsers(required=True, metavar="COMMAND", parser_class=argparse.ArgumentParser)
+        super().__init__("forbes data", "Build, fetch, compare, collect and look at the data.", "examples:")
+        self._commands = self.add_subparsers(required=True, metavar="COMMAND", parser_class=ArgumentParser)
 
     def add(self, name: str, target: str, summary: str, example: str) -> argparse.ArgumentParser:
         """Add a command and its example."""
@@ -96,7 +91,6 @@ def _add_collect(of_data: _Parser) -> None:
     summary = "Play episodes in a process of its own, and store them; interrupted, it goes on where it stopped."
     example = "collect --task cartpole_swingup --episodes 40 -o episodes/cartpole"
     play = of_data.add("collect", "forbes.training.collect_command:collect", summary, example)
-    play.formatter_class = argparse.RawDescriptionHelpFormatter
     play.epilog = (
         f"tasks:\n{TASKS}\n\n{play.epilog}\n"
         "         forbes data collect --policy RUN --episodes 80 -o episodes/cartpole    # 40 more, by an agent"
@@ -133,7 +127,7 @@ def _add_collect(of_data: _Parser) -> None:
     play.add_argument(
         "--fast", action="store_const", const=True, help="in DeepMind Control: no shadows, hence other pixels"
     )
-    play.add_argument("--timeout", type=float, help="seconds for an answer of the environment (default: 60)")
+    play.add_argument("--timeout", type=seconds, help="seconds for an answer of the environment (default: 60)")
 
 
 def _add_episodes(of_data: _Parser) -> None:
