@@ -5,7 +5,9 @@ from typing import Literal, NoReturn, TypeAlias
 
 from forbes.errors import ForbesError
 
-__all__ = ["ArgumentParser", "Dataset", "Fetched", "Origin", "Split", "positive"]
+__all__ = ["LONGEST", "ArgumentParser", "Dataset", "Fetched", "Origin", "Split", "positive", "seconds"]
+
+LONGEST = 1_000_000  # seconds; the system counts milliseconds in 32 bits
 
 Split: TypeAlias = Literal["train", "validation", "test"]
 Dataset: TypeAlias = Literal["strokes"]
@@ -17,8 +19,9 @@ Origin: TypeAlias = Literal["bundled", "dejong"]
 class ArgumentParser(argparse.ArgumentParser):
     """An `argparse.ArgumentParser` that keeps line breaks in its help and raises `ForbesError`."""
 
-    def __init__(self, prog: str, description: str) -> None:
-        super().__init__(prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    def __init__(self, prog: str, description: str, epilog: str | None = None) -> None:
+        raw = argparse.RawDescriptionHelpFormatter
+        super().__init__(prog, description=description, epilog=epilog, formatter_class=raw)
 
     def error(self, message: str) -> NoReturn:
         """Raise instead of printing the usage and leaving."""
@@ -30,3 +33,14 @@ def positive(text: str) -> int:
     if not text.isascii() or not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
     return int(text)
+
+
+def seconds(text: str) -> float:
+    """Parse how long to wait; for `type=`."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value <= LONGEST:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of seconds above 0, at most {LONGEST}")
+    return value

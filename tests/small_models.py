@@ -4,8 +4,21 @@ from functools import partial
 
 import torch
 
-from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ParticleModel, State, StateSpaceModel, VectorModel
+from forbes.beliefs import (
+    CategoricalBelief,
+    FlowBelief,
+    GaussianBelief,
+    MixtureBelief,
+)
+from forbes.models import (
+    Bernoulli,
+    MLPDecoder,
+    MLPEncoder,
+    ParticleModel,
+    State,
+    StateSpaceModel,
+    VectorModel,
+)
 
 BATCH, TIME, ACTION, STATE, HIDDEN = 5, 6, 2, 4, 7
 SHAPE = (1, 6, 6)
@@ -22,7 +35,7 @@ STATE_SPACE = {
 MODELS = STATE_SPACE | {
     "particles": partial(ParticleModel, GaussianBelief, particles=3),
     "soft particles": partial(ParticleModel, FLOW, particles=3, resampling="soft"),
-    "vector": partial(VectorModel, GaussianBelief, overshoot=2),
+    "vector": partial(VectorModel, GaussianBelief, overshoot=2, state_dim=0),
 }
 
 
@@ -34,7 +47,7 @@ class Bernoulli64(Bernoulli):
 
 
 def make_model(kind, action_dim=ACTION, width=9, seed=0):
-    state_dim = 0 if kind == "vector" else STATE
+    state_dim = MODELS[kind].keywords.get("state_dim", STATE)
     torch.manual_seed(seed)
     return MODELS[kind](
         encoder=MLPEncoder(SHAPE, width, layers=1),

@@ -100,14 +100,18 @@ def test_the_examples_of_its_help_can_be_run(example, monkeypatch, capsys):
     assert "class_path: forbes.training.WorldModel" in capsys.readouterr().out
 
 
-def test_what_its_help_says_people_change_can_be_changed(monkeypatch, capsys):
+def test_what_its_help_says_people_change_has_the_values_of_the_first_example(monkeypatch, capsys):
     monkeypatch.chdir(CONFIGS.parent)
     flags = [f"{name}={value}" for name, value in CHANGED if value != "TASK"]
-    with pytest.raises(SystemExit) as done:
-        main(["fit", "--config", "configs/strokes/forbes.yaml", *flags, "--print_config"])
+    printed = []
+    for changed in ([], flags):
+        with pytest.raises(SystemExit) as done:
+            main([*EXAMPLES[0].split(), *changed, "--print_config"])
+        assert done.value.code == 0
+        printed.append(capsys.readouterr().out)
 
-    assert done.value.code == 0
-    assert "state_dim: 8" in capsys.readouterr().out
+    assert "state_dim: 8" in printed[0]
+    assert printed[1] == printed[0]
 
 
 def test_all_flags_are_a_word_away(capsys):
@@ -171,8 +175,8 @@ def error_of(capsys, *arguments):
         (["--exploration", "0"], "did you mean model.exploration?"),
         (["mine.yaml"], "mine.yaml: a configuration needs its flag. Say: --config mine.yaml"),
         (
-            ["--trainer.logger", "TensorBoardLogger"],
-            "trainer.logger: save_dir missing, give it the run folder: --run_dir DIR --trainer.logger.save_dir DIR",
+            ["--trainer.logger", "TensorBoardLogger", "--trainer.logger.savedir", "logs"],
+            "trainer.logger.savedir: TensorBoardLogger has no such option, did you mean save_dir?",
         ),
         (["--trainer.callbacks", "ModelCheckpoint", "--trainer.callbacks.save_top_k", "-3"], "save_top_k=-3"),
         (["--model.belief", "FlowBelef"], "no class FlowBelef that fits here, did you mean FlowBelief?"),

@@ -1,130 +1,138 @@
-"""The recipes of CONTRIBUTING.md are followed: what they copy is copied, renamed and used from outside the package."""
+"""The recipes of CONTRIBUTING.md are followed word for word, in a copy of the repository."""
 
-import importlib
+import json
+import os
 import re
+import shutil
+import subprocess
 import sys
+import textwrap
 from pathlib import Path
+from typing import NamedTuple
 
-import pandas as pd
 import pytest
-import torch
-from small_models import ACTION, HIDDEN, SHAPE, Bernoulli64, random_model, sequences
 
-from forbes.cli import main
-from forbes.data import SequenceBatch, SequenceDataModule, Simulated
 from forbes.data.episode_store import EpisodeStore
-from forbes.figures.strokes import Family
-from forbes.figures.style import BLUE, save_figure
-from forbes.models import MLPDecoder, MLPEncoder
+from forbes.evaluation.record import read_record
+from forbes.parsers import compare
 from forbes.training.run_folder import RunFolder
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
+NEEDED = ("configs", "docs", "forbes", "tests")
+PROGRAMS = ("forbes", "pytest")
+"""Programs whose commands run in one process, after all edits; others make files."""
+
+FOLLOW = """
+import json, shlex, sys, traceback
+import pytest
+from forbes.cli import main
+
+if __name__ == "__main__":
+    programs, statuses = {"forbes": main, "pytest": pytest.main}, {}
+    for command in json.load(sys.stdin):
+        program, *arguments = shlex.split(command)
+        print("$", command, file=sys.stderr)
+        statuses[command] = int(programs[program](arguments))
+    json.dump(statuses, open("statuses.json", "w"))
+"""
 
 
-def recipe(heading):
-    """The text under a heading."""
-    return TEXT.split(f"## {heading}\n")[1].split("\n## ")[0]
+class Block(NamedTuple):
+    """A block of a recipe: commands, or edits."""
+
+    recipe: str
+    kind: str
+    text: str
 
 
-def named_in(heading, start):
-    """The file that a recipe names after a word."""
-    return ROOT / re.search(rf"{start} `([\w/]+\.(?:py|md))`", " ".join(recipe(heading).split()))[1]
+def blocks():
+    """All of them, in their order."""
+    found = []
+    for section in ("Introduction\n" + TEXT).split("\n## "):
+        recipe, text = section.split("\n", 1)
+        for _, kind, block in re.findall(r"^( *)```(\w+)\n(.*?)^ *```$", text, re.DOTALL | re.MULTILINE):
+            found.append(Block(recipe, kind, textwrap.dedent(block)))
+    return found
 
 
-@pytest.fixture
-def copy_of(in_tmp_path, monkeypatch):
-    """Copies a module to the working directory under another name, its class renamed, and imports it."""
-    monkeypatch.syspath_prepend(str(in_tmp_path))
+def commands(*programs):
+    """The commands of all recipes that call one of these programs."""
+    lines = [line for block in blocks() if block.kind == "sh" for line in block.text.splitlines()]
+    return [line for line in lines if line.split()[0] in programs]
 
-    def copy(path, old, new, module):
-        Path(f"{module}.py").write_text(re.sub(rf"\b{old}\b", new, path.read_text()))
-        importlib.invalidate_caches()
-        return getattr(importlib.import_module(module), new)
 
-    yield copy
-    for name in [name for name in sys.modules if name.startswith("your_")]:
-        del sys.modules[name]
+def apply(edits, root):
+    """Change the files that a block of edits names; each place must be there, once."""
+    for edit in edits.split("@@ ")[1:]:
+        name, *lines = edit.splitlines()
+        before, after = ("".join(f"{line[1:]}\n" for line in lines if line[0] in signs) for signs in (" -", " +"))
+        content = (root / name).read_text()
+        assert content.count(before) == 1, f"{name} has this {content.count(before)} times:\n{before}"
+        (root / name).write_text(content.replace(before, after))
+
+
+def copy_repository(root):
+    """Copy what the recipes need; the data, which none of them changes, stay where they are."""
+    for name in NEEDED:
+        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__", "*.npz"))
+    shutil.copy(ROOT / "pyproject.toml", root)
+    (root / "data").symlink_to(ROOT / "data")
 
 
 def test_every_file_that_a_recipe_names_exists():
     names = set(re.findall(r"`((?:forbes|tests|configs|docs)/[\w/]+(?:\.py|\.md)?)`", TEXT))
 
-    assert len(names) > 15
-    assert not [name for name in names if not (ROOT / name).exists() and "your" not in name]
+    assert len(names) >= 8
+    assert not [name for name in names if not (ROOT / name).exists() and "room" not in name]
 
 
-def test_a_belief_family_outside_this_repository_is_trained(copy_of, tiny_config):
-    copy_of(named_in("A belief family", "Copy"), "GaussianBelief", "YourBelief", "your_module")
-    command = re.search(r"    forbes (fit --allow-module your_module .*)", TEXT)[1]
-    command = command.replace("configs/strokes/forbes.yaml", str(tiny_config))
+def test_every_recipe_works_word_for_word(in_tmp_path):
+    copy_repository(in_tmp_path)
+    for block in blocks():
+        if block.kind == "diff":
+            apply(block.text, in_tmp_path)
+        for line in block.text.splitlines() if block.kind == "sh" else []:
+            if line.split()[0] not in PROGRAMS:
+                subprocess.run(["bash", "-c", line], check=True)
+    Path("follow.py").write_text(FOLLOW)
 
-    assert main([*command.split(), "--run_dir", "run"]) == 0
-
-    assert "your_module.YourBelief" in RunFolder("run").config.read_text()
-
-
-def test_a_model_copied_from_its_recipe_has_a_bound(copy_of):
-    kind = copy_of(named_in("A model whose filter differs", "Copy"), "VectorModel", "YourModel", "your_model")
-    decoder = MLPDecoder(HIDDEN, SHAPE, 9, layers=1)
-    parts = {"encoder": MLPEncoder(SHAPE, 9, layers=1), "decoder": decoder, "likelihood": Bernoulli64()}
-    model = kind(None, **parts, action_dim=ACTION, state_dim=0, hidden_dim=HIDDEN, mlp_dim=9, mlp_layers=1).double()
-
-    assert model.elbo(*sequences()).elbo.shape == (5,)
-
-
-def test_a_data_source_copied_from_its_recipe_gives_batches(copy_of, strokes_file):
-    kind = copy_of(named_in("A data source", "Copy"), "Strokes", "YourSource", "your_source")
-
-    data = SequenceDataModule(kind(path=str(strokes_file), validation=20), batch_size=4, length=6)
-
-    assert data.sequences("train", torch.arange(4)).observation.shape == (4, 6, 1, 28, 28)
-
-
-def test_the_environment_of_the_documentation_is_collected(in_tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(in_tmp_path))  # a process begins in the folder of the tests
-    path = re.search(r"Copy the 20 lines of \[(docs/environments.md)\]", recipe("An environment"))[1]
-    text = (ROOT / path).read_text()
-    Path("my_room.py").write_text(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1])
-    command = re.search(r"    forbes (data collect --allow-module my_room .*)", text)[1]
-
-    assert main(command.replace("--episodes 10", "--episodes 1").split()) == 0
-
-    assert len(EpisodeStore("episodes/room").records) == 1
-    del sys.modules["my_room"]
-
-
-def test_a_process_copied_from_its_recipe_has_a_filter(copy_of):
-    names = re.search(
-        r"`forbes/pomdps/`.*?`(linear_gaussian.py)`", recipe("A process whose belief is known"), re.DOTALL
-    )
-    kind = copy_of(ROOT / "forbes/pomdps" / names[1], "LinearGaussian", "YourProcess", "your_process")
-
-    source = Simulated(kind(), 4, 2, 2)
-    drawn = source.trajectories("train", 5)
-
-    assert source.process.exact_filter(drawn.observation, drawn.action).log_likelihood.shape == (4,)
-    assert SequenceDataModule(source, 2, 5).sequences("test", torch.arange(2)).observation.shape[:2] == (2, 5)
-
-
-def test_a_score_copied_from_its_recipe_adds_nats_to_each_step(copy_of):
-    score = copy_of(named_in("A score", "as in"), "score_particles", "your_score", "your_scores")
-    observation, action, mask = sequences()
-    zeros = torch.zeros(mask.shape)
-    batch = SequenceBatch(observation, action, zeros, mask, zeros[..., None], ~mask)
-
-    scores = score(random_model("gaussian"), batch, 3)
-
-    assert {name: (values.shape, values.dtype) for name, values in scores.items()} == dict.fromkeys(
-        ("fivo", "ess"), (mask.shape, torch.float64)
+    subprocess.run(
+        [sys.executable, "follow.py"],
+        input=json.dumps(commands(*PROGRAMS)),
+        env=os.environ | {"PYTHONPATH": str(in_tmp_path), "OMP_NUM_THREADS": "1"},
+        text=True,
+        check=True,
     )
 
+    assert json.loads(Path("statuses.json").read_text()) == dict.fromkeys(commands(*PROGRAMS), 0)
+    (family,) = Path("runs/strokes/yours").iterdir()
+    for run, name in [(family, "YourBelief"), ("runs/your_model", "YourModel"), ("runs/your_source", "YourSource")]:
+        assert f".{name}" in RunFolder(run).config.read_text()
+    assert len(EpisodeStore("episodes/room").records) == 3
+    assert "test[:10]/forward_kl[S=100]" in read_record("runs/your_process")
+    assert "test[:20]/yours[categorical,K=128]" in read_record("runs/dry")
+    assert Path("figures/yours.png").is_file()
+    assert Path("figures/yours.pdf").is_file()
+    assert Path("runs/your_picture/figures/yours.png").is_file()
 
-def test_a_figure_copied_from_its_recipe_is_saved_in_both_formats(copy_of):
-    path = named_in("A figure", "`paper_style\\(\\)`;")
-    draw = copy_of(path, "elbo_against_updates", "your_figure", "your_figures")
-    family = Family("FORBES", BLUE, random_model("gaussian"), [pd.Series({1: -9.0, 2: -8.0})], [])
 
-    for kind in ("png", "pdf"):
-        save_figure(draw([family], {}), Path(f"figure.{kind}"))
-        assert Path(f"figure.{kind}").stat().st_size > 0
+def test_the_comparison_of_a_recipe_is_one_that_can_be_made(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    (command,) = re.findall(r"`forbes compare ([^`]+)`", TEXT)
+
+    *others, yours = compare.parser().parse_args(command.split()).configs
+
+    assert all(map(os.path.isfile, others))
+    assert f"> {yours}\n" in TEXT
+
+
+def test_a_place_that_is_not_there_is_no_edit(tmp_path):
+    (tmp_path / "a.py").write_text("one\ntwo\ntwo\n")
+
+    apply("@@ a.py\n one\n+half\n", tmp_path)
+    for place in (" three", " two"):
+        with pytest.raises(AssertionError, match="times"):
+            apply(f"@@ a.py\n{place}\n+more\n", tmp_path)
+
+    assert (tmp_path / "a.py").read_text() == "one\nhalf\ntwo\ntwo\n"

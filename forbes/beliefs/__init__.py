@@ -6,4 +6,11 @@ from forbes.beliefs.flow import FlowBelief
 from forbes.beliefs.gaussian import GaussianBelief
 from forbes.beliefs.mixture import MixtureBelief
 
-__all__ = ["BeliefFamily", "BeliefHead", "CategoricalBelief", "FlowBelief", "GaussianBelief", "MixtureBelief"]
+__all__ = [
+    "BeliefFamily",
+    "BeliefHead",
+    "CategoricalBelief",
+    "FlowBelief",
+    "GaussianBelief",
+    "MixtureBelief",
+]

@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
+from forbes.arguments import LONGEST
 from forbes.data.collection import MakePolicy, collect_episodes, describe_environment, episode_seed
 from forbes.data.episode_store import EpisodeStore, EpisodeWriter, first_held
 from forbes.data.episodes import EpisodeRecord
@@ -44,8 +45,10 @@ class Experience(SequenceSource):
         timeout: float = 60.0,
         time_limit: int = TIME_LIMIT,
     ) -> None:
-        if not timeout > 0:
-            raise ForbesError(f"Experience: timeout is {timeout}, expected seconds above 0. Choose another")
+        if not 0 < timeout <= LONGEST:
+            raise ForbesError(
+                f"Experience: timeout is {timeout}, expected seconds above 0, at most {LONGEST}. Choose another"
+            )
         if time_limit < 1:
             raise ForbesError(f"Experience: time_limit is {time_limit}, expected at least 1 step. Choose another")
         self.task, self.options, self.capacity = task, options or {}, capacity

@@ -30,6 +30,26 @@ CLASS: an Environment of your own, of a module named by --allow-module
 anything else is a task of the DeepMind Control Suite, domain_task: cartpole_swingup, ball_in_cup_catch, walker_walk"""
 
 
+def _open_process(task: str, shows: "Shown" = "observation") -> Environment:
+    """Build a known process where it is used: tensors do not travel, and only here is torch imported."""
+    from forbes import pomdps
+    from forbes.envs.known_process import KnownProcess
+
+    processes: dict[str, Callable[[], pomdps.Process]] = {
+        "mountain_hike": pomdps.MountainHike,
+        "multi_start_hike": partial(pomdps.MountainHike, "multi", observation_std=1.5),
+        "t_maze": pomdps.TMaze,
+        "tiger": pomdps.Tiger,
+    }
+    return KnownProcess(processes[task](), _HORIZONS[task], shows)
+
+
+_NAMED: dict[str, Callable[..., Environment]] = {
+    **{name: partial(_open_process, name) for name in _HORIZONS},
+}
+"""Environments of this package that have a name of their own."""
+
+
 def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
     """Give what makes the environment of a task; it can be sent to another process.
 
@@ -45,12 +65,12 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
     make: Callable[..., Environment]
     if task in own:
         make = own[task]
-    elif task in _HORIZONS:
-        make = partial(_open_process, task)
+    elif task in _NAMED:
+        make = _NAMED[task]
     elif task.startswith(_GYMNASIUM):
         _require_known_module(task)
         make = partial(Gymnasium, task.removeprefix(_GYMNASIUM))
-    elif near := difflib.get_close_matches(task, [*own, *_HORIZONS], n=1, cutoff=0.8):
+    elif near := difflib.get_close_matches(task, [*own, *_NAMED], n=1, cutoff=0.8):
         raise ForbesError(f"{task}: no such task. Did you mean {near[0]}?")
     else:
         make = partial(DeepMindControl, task)
@@ -73,20 +93,6 @@ def _require_known_module(task: str) -> None:
             f"{task}: {module} is not a package that registers environments. If you trust it, add: "
             f"--allow-module {module}"
         )
-
-
-def _open_process(task: str, shows: "Shown" = "observation") -> Environment:
-    """Build a known process where it is used: tensors do not travel, and only here is torch imported."""
-    from forbes import pomdps
-    from forbes.envs.known_process import KnownProcess
-
-    processes: dict[str, Callable[[], pomdps.Process]] = {
-        "mountain_hike": pomdps.MountainHike,
-        "multi_start_hike": partial(pomdps.MountainHike, "multi", observation_std=1.5),
-        "t_maze": pomdps.TMaze,
-        "tiger": pomdps.Tiger,
-    }
-    return KnownProcess(processes[task](), _HORIZONS[task], shows)
 
 
 def _descendants(kind: type) -> Iterator[type]:

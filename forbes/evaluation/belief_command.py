@@ -18,7 +18,7 @@ from forbes.evaluation.belief_errors import ERRORS, Belief, belief_errors, mode_
 from forbes.evaluation.bounds import Increments
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.progress import with_progress
-from forbes.evaluation.record import describe, require_readable, write_record
+from forbes.evaluation.record import describe, require_readable, results_folders, write_record
 from forbes.evaluation.runs import data_name, data_sha256, split_batches
 from forbes.evaluation.scoring import Scores, require_finite
 from forbes.parsers.beliefs import parser
@@ -47,7 +47,8 @@ class _Run(NamedTuple):
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
-    require_readable(args.runs)
+    folders = results_folders(args.runs, args.output)
+    require_readable(folders.values())
     runs = [_load(path) for path in args.runs]
     sha256 = _same_data(runs, args)
     table = _table(args)
@@ -65,7 +66,7 @@ def main(argv: Sequence[str]) -> None:
         }
         names = {metric: _metric_name(run, args, metric) for metric in scores.values}
         entries = {name: _describe(scores, metric) | origin for metric, name in names.items()}
-        write_record(run.path, entries, {name: scores.values[metric].sum(1) for metric, name in names.items()})
+        write_record(folders[run.path], entries, {name: scores.values[metric].sum(1) for metric, name in names.items()})
         table.add_row(*_row(run.path, f"{type(run.module.model.head).__name__}, {run.module.objective}", scores))
     table.add_row(*_row("", "moment-matched Gaussian", _matched(runs[0], args)))
     Console(width=None if sys.stdout.isatty() else 200).print(table)

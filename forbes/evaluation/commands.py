@@ -130,7 +130,7 @@ def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[dict[str, bool
 
 def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
     """Say which passes to make, on how many sequences; refuse runs that cannot be compared there."""
-    numbers = {"elbo": args.samples, "pll": args.particles, "fivo": args.particles, "open-loop": args.futures}
+    numbers = {name: getattr(args, option) for name, option in PASSES.items()}
     wanted = {
         name: make_pass(name, numbers[name], args.batch_size, args.context) for name in PASSES if name in args.scores
     }

@@ -10,23 +10,17 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
+from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
-from forbes.models import BeliefModel, ParticleModel, StateSpaceModel, VectorModel
+from forbes.models import BeliefModel, StateSpaceModel
 from forbes.training.loading import open_run
 
 __all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "require_comparable", "run_titles"]
 __all__ += ["split_batches"]
 
-_FAMILIES: dict[type[nn.Module], str] = {
-    GaussianBelief: "RSSM",
-    FlowBelief: "FORBES",
-    MixtureBelief: "Mixture",
-    CategoricalBelief: "Categorical",
-    ParticleModel: "Particle",
-    VectorModel: "Vector",
-}
+_PUBLISHED: dict[type[nn.Module], str] = {GaussianBelief: "RSSM", FlowBelief: "FORBES"}
+"""Models whose name is not that of their class."""
 
 
 class TrainedRun(NamedTuple):
@@ -43,9 +37,12 @@ class TrainedRun(NamedTuple):
 
     @property
     def family(self) -> str:
-        """The model's name, e.g. FORBES, with what its experiment's name adds, e.g. RSSM wide for `rssm_wide`."""
+        """The model's name, e.g. FORBES, or Mixture of a `MixtureBelief`.
+
+        What its experiment's name adds follows: RSSM wide for `rssm_wide`.
+        """
         kind = _kind(self.model)
-        name = _FAMILIES.get(kind, kind.__name__)
+        name = _PUBLISHED.get(kind, kind.__name__.removesuffix("Belief").removesuffix("Model"))
         for part in reversed(Path(self.path).resolve().parts):
             if match := re.fullmatch(rf"{name}((?:_[a-z]+)+)(?:-\d+)?", part, re.IGNORECASE):
                 return name + match[1].replace("_", " ")

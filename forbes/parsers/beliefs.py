@@ -3,6 +3,7 @@
 from typing import get_args
 
 from forbes.arguments import ArgumentParser, Split, positive
+from forbes.parsers.evaluate import add_output
 
 __all__ = ["parser"]
 
@@ -27,7 +28,7 @@ gives the share of sequences in which it is, instead of a mean, and the record h
 
 Below the runs stands the diagonal Gaussian of the exact belief's mean and variance: by the forward KL, the best of its
 family. Where the exact belief is a grid, sums over its cells, elsewhere S samples of both. Writes evaluation.json, and
-evaluation.npz with each sequence's numbers, into each run folder."""
+evaluation.npz with each sequence's numbers, into each run folder, or elsewhere: --output DIR"""
 
 
 def parser() -> ArgumentParser:
@@ -36,6 +37,7 @@ def parser() -> ArgumentParser:
     command.add_argument(
         "runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made of a KnownBelief"
     )
+    add_output(command)
     command.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
     command.add_argument("--sequences", type=positive, default=200, help="the first so many (default: 200)")
     command.add_argument("--samples", type=positive, default=100, help="S of beliefs and ELBO (default: 100)")

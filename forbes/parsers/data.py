@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import get_args
 
-from forbes.arguments import Dataset, Fetched, Origin, Split, positive
+from forbes.arguments import ArgumentParser, Dataset, Fetched, Origin, Split, positive, seconds
 from forbes.envs.tasks import TASKS
 
 __all__ = ["main", "parser"]
@@ -31,17 +31,12 @@ def parser() -> argparse.ArgumentParser:
     return of_data
 
 
-class _Parser(argparse.ArgumentParser):
+class _Parser(ArgumentParser):
     """Has a command under each of its names."""
 
     def __init__(self) -> None:
-        super().__init__(
-            prog="forbes data",
-            description="Build, fetch, compare, collect and look at the data.",
-            epilog="examples:",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        self._commands = self.add_subparsers(required=True, metavar="COMMAND", parser_class=argparse.ArgumentParser)
+        super().__init__("forbes data", "Build, fetch, compare, collect and look at the data.", "examples:")
+        self._commands = self.add_subparsers(required=True, metavar="COMMAND", parser_class=ArgumentParser)
 
     def add(self, name: str, target: str, summary: str, example: str) -> argparse.ArgumentParser:
         """Add a command and its example."""
@@ -75,16 +70,20 @@ def _add_strokes(of_data: _Parser) -> None:
     compare = of_data.add("compare-strokes", "forbes.data.commands:compare_strokes", summary, example)
     compare.add_argument("one", type=Path, help="a stroke file")
     compare.add_argument("other", type=Path, help="another one, of the same digits")
-    compare.add_argument("--split", choices=("train", "test"), default="test", help="digits to compare")
+    compare.add_argument("--split", choices=("train", "test"), default="test", help="digits to compare (default: test)")
 
     summary = "Draw digits as they are written: frames coloured from the first point to the last, and the strokes."
     example = "show strokes --split test --index 0 1 2 -o strokes.png"
     look = of_data.add("show", "forbes.data.commands:show", summary, example)
     look.add_argument("dataset", choices=get_args(Dataset))
-    look.add_argument("--split", choices=get_args(Split), default="test", help="split of the digits")
-    look.add_argument("--index", type=int, nargs="+", default=[0, 1, 2], help="numbers of the digits in their split")
-    look.add_argument("-o", "--output", type=Path, default=Path("strokes.png"), help="picture to write")
-    look.add_argument("--origin", choices=get_args(Origin), default="bundled", help="set of strokes")
+    look.add_argument("--split", choices=get_args(Split), default="test", help="split of the digits (default: test)")
+    look.add_argument(
+        "--index", type=int, nargs="+", default=[0, 1, 2], help="numbers of the digits in their split (default: 0 1 2)"
+    )
+    look.add_argument(
+        "-o", "--output", type=Path, default=Path("strokes.png"), help="picture to write (default: strokes.png)"
+    )
+    look.add_argument("--origin", choices=get_args(Origin), default="bundled", help="set of strokes (default: bundled)")
     look.add_argument("--path", type=Path, help="read this stroke file instead of the origin's own")
 
 
@@ -92,24 +91,46 @@ def _add_collect(of_data: _Parser) -> None:
     summary = "Play episodes in a process of its own, and store them; interrupted, it goes on where it stopped."
     example = "collect --task cartpole_swingup --episodes 40 -o episodes/cartpole"
     play = of_data.add("collect", "forbes.training.collect_command:collect", summary, example)
-    play.formatter_class = argparse.RawDescriptionHelpFormatter
     play.epilog = (
         f"tasks:\n{TASKS}\n\n{play.epilog}\n"
         "         forbes data collect --policy RUN --episodes 80 -o episodes/cartpole    # 40 more, by an agent"
     )
     play.add_argument("--task", help="see below; an agent has its own")
-    play.add_argument("--episodes", type=positive, default=10, help="how many DIR has had in the end (10)")
-    play.add_argument("--policy", default="random", metavar="random|RUN", help="who acts: a run's agent explores")
+    play.add_argument("--episodes", type=positive, default=10, help="how many DIR has had in the end (default: 10)")
+    play.add_argument(
+        "--policy",
+        default="random",
+        metavar="random|RUN",
+        help="who acts: a run's agent explores (default: random)",
+    )
     play.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help=_STORED)
-    play.add_argument("--seed", type=int, default=0, help="episode n is a function of the seed and n")
-    play.add_argument("--action-repeat", type=positive, help="frames for which an action is held")
-    play.add_argument("--pixels", action=argparse.BooleanOptionalAction, help="observe images, or what is measured")
-    play.add_argument("--size", type=positive, help="pixels a side (64)")
-    play.add_argument("--part", help="of Gymnasium: the entry of a Dict that is observed")
-    play.add_argument("--camera", type=int, help="number of the camera")
-    play.add_argument("--fast", action="store_const", const=True, help="no shadows: other pixels")
-    play.add_argument("--time-limit", type=positive, metavar="STEPS", help="truncate longer episodes (100,000)")
-    play.add_argument("--timeout", type=float, help="seconds for an answer of the environment (60)")
+    play.add_argument("--seed", type=int, default=0, help="episode n is a function of the seed and n (default: 0)")
+    play.add_argument(
+        "--action-repeat",
+        type=positive,
+        help="steps for which an action is held (default: 2 in DeepMind Control, 1 in Gymnasium)",
+    )
+    play.add_argument(
+        "--pixels",
+        action=argparse.BooleanOptionalAction,
+        help="observe images that are drawn, or what is measured (default: images in DeepMind Control only)",
+    )
+    play.add_argument(
+        "--size",
+        type=positive,
+        help="pixels a side of images (default: 64 of those that are drawn, else the environment's own)",
+    )
+    play.add_argument("--part", help="in Gymnasium: the entry of a Dict that is observed (default: all of them)")
+    play.add_argument(
+        "--camera", type=int, help="in DeepMind Control: number of the camera (default: 0, 2 of quadruped)"
+    )
+    play.add_argument(
+        "--fast", action="store_const", const=True, help="in DeepMind Control: no shadows, hence other pixels"
+    )
+    play.add_argument(
+        "--time-limit", type=positive, metavar="STEPS", help="truncate longer episodes (default: 100,000)"
+    )
+    play.add_argument("--timeout", type=seconds, help="seconds for an answer of the environment (default: 60)")
 
 
 def _add_episodes(of_data: _Parser) -> None:

@@ -6,9 +6,15 @@ from typing import get_args
 
 from forbes.arguments import ArgumentParser, Split, positive
 
-__all__ = ["PASSES", "SUBSET", "add_acting_samples", "add_score_options", "parser"]
+__all__ = ["PASSES", "SUBSET", "add_acting_samples", "add_output", "add_score_options", "parser"]
 
-PASSES = ("elbo", "pll", "fivo", "open-loop")
+PASSES = {
+    "elbo": "samples",
+    "pll": "particles",
+    "fivo": "particles",
+    "open-loop": "futures",
+}
+"""What --scores may name, with the option that has its number of samples."""
 SUBSET = 1000
 """Sequences that particles are spent on, unless --sequences says otherwise."""
 
@@ -61,11 +67,16 @@ def parser() -> ArgumentParser:
         "runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made, or a checkpoint in it"
     )
     command.add_argument("--checkpoint", metavar="NAME", help="another than last.ckpt, in checkpoints/ of every RUN")
-    command.add_argument("--output", metavar="DIR", help="results go to DIR/NAME-OF-RUN, not into the run folders")
+    add_output(command)
     command.add_argument("--episodes", type=positive, default=10, help="that an agent plays (default: 10)")
     add_acting_samples(command)
     add_score_options(command)
     return command
+
+
+def add_output(parser: argparse.ArgumentParser) -> None:
+    """Add what says where results go."""
+    parser.add_argument("--output", metavar="DIR", help="results go to DIR/NAME-OF-RUN, not into the run folders")
 
 
 def add_acting_samples(parser: argparse.ArgumentParser) -> None:
@@ -94,7 +105,7 @@ def add_score_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--context", type=positive, default=15, help="steps seen by the open-loop score (default: 15)")
     parser.add_argument("--batch-size", type=positive, default=250, help="sequences at a time (default: 250)")
     parser.add_argument("--seed", type=int, default=0, help="of the noise (default: 0)")
-    parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda, cuda:1 …")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1 … (default: auto)")
 
 
 def _all_or_number(text: str) -> int:

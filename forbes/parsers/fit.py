@@ -19,15 +19,15 @@ examples:
   forbes fit --config configs/strokes/rssm.yaml --seed_everything 1 --run_dir runs/rssm-1
   forbes fit --resume runs/rssm-1 --trainer.max_epochs 20
 
-Every key of a configuration is a flag, without its init_args. Those that people change:
-  --model.belief FlowBelief         family of the belief; --model.belief.layers 3 sets an argument of it
+Every key of a configuration is a flag, without its init_args. Those that people change, as in the first example:
+  --model.belief FlowBelief         family of the belief; --model.belief.layers 4 sets an argument of it
   --model.state_dim 8               dimensions of the state; --model.hidden_dim 200 of the recurrent one
   --model.free_nats 0               nats of the KL that cost nothing; --model.kl_warmup 500 updates until it counts
-  --model.learning_rate 3e-3        with --model.schedule cosine it ends at 0
+  --model.learning_rate 6e-3        with --model.schedule cosine it ends at 0
   --data.batch_size 50              sequences of an update; --data.length 30 steps of each
-  --data.updates_per_epoch 300      between two validations and checkpoints; times --trainer.max_epochs 10
+  --data.updates_per_epoch 500      between two validations and checkpoints; times --trainer.max_epochs 12
   --data.source Strokes             where sequences come from; --data.source.task TASK of an agent
-  --trainer.accelerator cpu         or gpu; auto by default
+  --trainer.accelerator auto        or cpu, gpu
   --seed_everything 0               weights, noise, order of the data and an agent's episodes
 """
 _OTHERS = """\

@@ -26,5 +26,5 @@ def parser() -> ArgumentParser:
     command.add_argument("--episodes", type=positive, default=1, help="how many (default: 1)")
     add_acting_samples(command)
     command.add_argument("--seed", type=int, default=0, help="of the episodes (default: 0)")
-    command.add_argument("--device", default="auto", help="auto (default), cpu, cuda, cuda:1 …")
+    command.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1 … (default: auto)")
     return command

@@ -23,7 +23,9 @@ log p - PLL are 0 at best; PLL, the prequential log-likelihood, scores each beli
 def parser() -> ArgumentParser:
     """Return the parser of `forbes theorem`."""
     command = ArgumentParser("forbes theorem", _DESCRIPTION)
-    command.add_argument("--transition", type=_finite, metavar="F", help="default: 1; with 0 all four are exact")
+    command.add_argument(
+        "--transition", type=_finite, metavar="F", help="default: 1; with 0 all four beliefs are exact"
+    )
     command.add_argument("--process-noise", type=_variance, metavar="Q", help="a variance; default: 1")
     command.add_argument("--observation-noise", type=_variance, metavar="R", help="a variance; default: 1")
     command.add_argument("--steps", type=_steps, default=15, metavar="T", help=f"at most {_STEPS} (default: 15)")

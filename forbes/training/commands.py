@@ -37,6 +37,7 @@ from forbes.training.configuration import (
 )
 from forbes.training.divergence import DivergedError, StopAtDivergence
 from forbes.training.loading import check_weights, weights_of
+from forbes.training.loggers import ParserOfRuns, open_logger
 from forbes.training.lower_rate import MOST, LowerRateError, at_half_the_rate
 from forbes.training.metrics_log import JsonLinesLogger, MarkStart
 from forbes.training.progress import progress
@@ -158,6 +159,7 @@ class _Experiment(LightningCLI):
             run=False,
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,
+            parser_class=ParserOfRuns,
         )
 
     def add_default_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -220,7 +222,8 @@ class _Experiment(LightningCLI):
             callbacks.append(SaveLast(run))
         loggers = config["logger"]
         if loggers is not False:
-            loggers = [JsonLinesLogger(run.metrics), *_as_list(None if loggers is True else loggers)]
+            named = _as_list(None if loggers is True else loggers)
+            loggers = [JsonLinesLogger(run.metrics), *(open_logger(logger, run.path) for logger in named)]
         return {"logger": loggers, "default_root_dir": config["default_root_dir"] or run.path}
 
     def _open_run(self) -> RunFolder:

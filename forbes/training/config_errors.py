@@ -59,8 +59,6 @@ def _supply(key: str, missing: str) -> str:
     """Say how to give what is missing: of a class, or of the whole configuration."""
     if not key:
         return "give a configuration: --config configs/strokes/forbes.yaml"
-    if missing == "save_dir":
-        return f"give it the run folder: --run_dir DIR --{key}.save_dir DIR"
     return f"give it: --{key}.{missing} VALUE"
 
 

@@ -10,7 +10,13 @@ from functools import partial
 import pytest
 import torch
 
-from forbes.beliefs import BeliefHead, CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
+from forbes.beliefs import (
+    BeliefHead,
+    CategoricalBelief,
+    FlowBelief,
+    GaussianBelief,
+    MixtureBelief,
+)
 from forbes.deferred import Loop
 
 CONTEXT = 3

@@ -201,6 +201,14 @@ def test_vectors_are_described_and_not_drawn(tmp_path, capsys):
             "tiger: its environment has no option fast. Leave it out",
         ),
         (["collect", "--task", "tiger", "-o", "/proc/x"], "/proc/x: no such file or directory"),
+        *(
+            (
+                ["collect", "--task", "tiger", "-o", "x", "--timeout", seconds],
+                f"forbes data collect: argument --timeout: {seconds} is not a number of seconds above 0, at most "
+                "1000000. See forbes data collect --help",
+            )
+            for seconds in ("0", "-1", "nan", "inf", "1e9", "soon")
+        ),
     ],
 )
 def test_what_cannot_be_is_one_sentence(arguments, sentence, in_tmp_path, capsys):

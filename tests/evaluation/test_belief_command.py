@@ -98,6 +98,22 @@ def test_prints_and_records_the_errors_of_the_run_beside_the_best_gaussian(run, 
     assert f"{regret.mean():.3f}" in out
 
 
+def test_results_go_elsewhere_and_the_run_stays_as_it_was(run, tmp_path):
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+    assert beliefs(run, "--sequences", "4", "--output", tmp_path / "out") == 0
+
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    assert len(record(tmp_path / "out" / "run")) == len(METRICS) + 1
+    assert (tmp_path / "out" / "run" / "evaluation.npz").is_file()
+
+
+def test_a_run_that_cannot_be_written_to_asks_for_another_folder(run, monkeypatch, capsys):
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+
+    assert "cannot be written to. Let the results go elsewhere: --output DIR" in error_of(capsys, "beliefs", run)
+
+
 def test_the_same_seed_gives_the_same_numbers_and_the_first_ten_do_not_need_the_others(run):
     curves = []
     for flags in (["--sequences", "10"], ["--sequences", "10"], ["--sequences", "10", "--seed", "1"]):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_models import make_model
 
 from forbes.cli import main
 from forbes.evaluation import scoring, tables
@@ -417,3 +418,19 @@ def test_wrong_arguments_are_named(runs, tmp_path, capsys):
 )
 def test_the_folder_of_a_run_adds_to_its_family(runs, path, family):
     assert load_runs(runs[1:])[0]._replace(path=path).family == family
+
+
+@pytest.mark.parametrize(
+    ("kind", "family"),
+    [
+        ("gaussian", "RSSM"),
+        ("flow", "FORBES"),
+        ("flow in the prior", "FORBES"),
+        ("mixture", "Mixture"),
+        ("categorical", "Categorical"),
+        ("particles", "Particle"),
+        ("vector", "Vector"),
+    ],
+)
+def test_a_family_has_its_published_name_or_that_of_its_class(runs, kind, family):
+    assert load_runs(runs[:1])[0]._replace(path="r-1", model=make_model(kind)).family == family

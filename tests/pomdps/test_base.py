@@ -7,7 +7,16 @@ import pytest
 import torch
 
 from forbes.errors import ForbesError
-from forbes.pomdps import LightDark, LinearGaussian, MirrorSensor, MountainHike, Process, Tiger, TMaze, Ungm
+from forbes.pomdps import (
+    LightDark,
+    LinearGaussian,
+    MirrorSensor,
+    MountainHike,
+    Process,
+    Tiger,
+    TMaze,
+    Ungm,
+)
 from forbes.pomdps.distributions import PointMass
 from forbes.pomdps.hmm import FiniteProcess
 

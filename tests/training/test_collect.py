@@ -223,8 +223,9 @@ def test_an_environment_that_hangs_ends_the_training_after_its_time(tmp_path, ca
 
     error = capsys.readouterr().err.splitlines()[-1]
     assert "it hangs, no answer to step within 1 s; so broke episode 0 3 times" in error
-    assert fit("--config", write_config(tmp_path), "--data.source.timeout", 0) == 2
-    assert "Experience: timeout is 0" in capsys.readouterr().err
+    for seconds in ("0", ".nan", ".inf"):
+        assert fit("--config", write_config(tmp_path), "--data.source.timeout", seconds) == 2
+        assert f"Experience: timeout is {float(seconds.strip('.'))}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("overlap", ["", ", overlap: true"])

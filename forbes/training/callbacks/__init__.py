@@ -12,5 +12,16 @@ from forbes.training.callbacks.picture import PictureCallback
 from forbes.training.callbacks.prediction_grid import PredictionGrid
 from forbes.training.callbacks.return_curve import ReturnCurve
 
-__all__ = ["BeliefPlot", "Collect", "CudaGraph", "ElboCurve", "EpisodeVideo", "ImaginedFutures", "OpenLoopPanel"]
-__all__ += ["ParameterCount", "PictureCallback", "PredictionGrid", "ReturnCurve"]
+__all__ = [
+    "BeliefPlot",
+    "Collect",
+    "CudaGraph",
+    "ElboCurve",
+    "EpisodeVideo",
+    "ImaginedFutures",
+    "OpenLoopPanel",
+    "ParameterCount",
+    "PictureCallback",
+    "PredictionGrid",
+    "ReturnCurve",
+]
