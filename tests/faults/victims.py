@@ -6,6 +6,7 @@ hooks of its own. The processes are forked from one that has imported everything
 """
 
 import atexit
+import fcntl
 import os
 import re
 import signal
@@ -64,13 +65,18 @@ def run(
         fault: what ends it.
         before: is called in the new process first.
     """
-    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as operations:
+    output, said = os.pipe()  # no file, since a limit of their size would hold for it too
+    fcntl.fcntl(said, fcntl.F_SETPIPE_SZ, 2**20)
+    os.set_blocking(output, False)
+    with tempfile.TemporaryFile() as operations, open(output, "rb") as reader:
         process = os.fork()
         if process == 0:
-            files = output.fileno(), operations.fileno()
-            _command([str(argument) for argument in arguments], folder, fault, before, *files)
+            command = [str(argument) for argument in arguments]
+            _command(command, folder, fault, before, said, operations.fileno())
+        os.close(said)
         status = os.waitstatus_to_exitcode(_wait(process, fault))
-        return Ending(status, _content(output), _content(operations).splitlines(), left_over(process))
+        found = (reader.read() or b"").decode(errors="replace")
+        return Ending(status, found, _content(operations).splitlines(), left_over(process))
 
 
 def run_real(arguments: list[object], fault: Fault | None = None) -> Ending:
