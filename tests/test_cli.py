@@ -145,6 +145,18 @@ def test_each_command_explains_itself(name, capsys):
     assert f"usage: forbes {name}" in capsys.readouterr().out
 
 
+def test_misspelt_arguments_of_a_class_are_named(tiny_config, tmp_path, capsys):
+    """jsonargparse takes what stands beside class_path for an argument of the class that is the default."""
+    config = tmp_path / "config.yaml"
+    text = tiny_config.read_text()
+    assert "MLPEncoder, init_args" in text
+    config.write_text(text.replace("MLPEncoder, init_args", "MLPEncoder, int_args"))
+
+    sentence = error_of(capsys, "fit", "--config", str(config))
+
+    assert sentence == f"{config}: model.encoder: MLPEncoder: expected init_args beside class_path, found int_args"
+
+
 def error_of(capsys, *arguments):
     """Run a command that must fail with one sentence and nothing else, and give the sentence."""
     assert main(list(arguments)) == 2

@@ -80,8 +80,9 @@ def _groups(folder: Path, options: argparse.Namespace) -> Iterator[Group]:
     overlapping = kills.training("agent with overlap and capacity", overlap)
     trained = folder / "whole" / strokes.name / "run"
     evaluation = kills.evaluation(trained)
-    starting, comparison = kills.starting(strokes), kills.comparison(digits)
-    shares = {strokes: 0.3, acting: 0.3, overlapping: 0.2, evaluation: 0.1, starting: 0.06, comparison: 0.04}
+    collection, starting, comparison = kills.collection(), kills.starting(strokes), kills.comparison(digits)
+    shares = {strokes: 0.25, acting: 0.3, overlapping: 0.2, evaluation: 0.1, collection: 0.05}
+    shares |= {starting: 0.06, comparison: 0.04}
     wholes = {scenario: scenario.straight(folder / "whole" / scenario.name) for scenario in shares}
     chunks = [(n, min(CHUNK, options.inputs - n)) for n in range(0, options.inputs, CHUNK)]
     for scenario, share in shares.items():
@@ -93,7 +94,7 @@ def _groups(folder: Path, options: argparse.Namespace) -> Iterator[Group]:
             "at random",
             [functools.partial(strike, folder / scenario.name / str(n), fault) for n, fault in enumerate(faults)],
         )
-    for scenario in (strokes, acting, overlapping, evaluation):
+    for scenario in (strokes, acting, overlapping, evaluation, collection):
         place, whole = folder / f"without {scenario.name}", wholes[scenario].result
         yield Group(
             f"{scenario.name}: on a full disk it ends with one sentence, and nothing is lost",
@@ -110,10 +111,10 @@ def _groups(folder: Path, options: argparse.Namespace) -> Iterator[Group]:
     )
     yield Group(
         "two at once do what one does, or one of them is refused",
-        "two trainings, evaluations, comparisons in one folder",
+        "two trainings, evaluations, collections, comparisons in one folder",
         [
             functools.partial(resources.two_at_once, each, wholes[each].result, folder / f"two of {each.name}")
-            for each in (strokes, acting, evaluation, comparison)
+            for each in (strokes, acting, evaluation, collection, comparison)
         ],
     )
     yield Group(

@@ -17,6 +17,7 @@ import torch
 from faults.outcome import Outcome
 from faults.victims import Ending, Fault, run, run_real
 
+from forbes.data.episode_store import EpisodeStore
 from forbes.errors import ForbesError
 from forbes.evaluation.record import read_arrays, read_record
 from forbes.training.checkpoint import read_checkpoint
@@ -168,6 +169,12 @@ def evaluation(trained_run: Path) -> Scenario:
     )
 
 
+def collection() -> Scenario:
+    """`forbes data collect`."""
+    play = ["--allow-module", "toy_environments", "data", "collect", "--task", "Parrot", "--episodes", "4", "-o"]
+    return Scenario("collection", lambda folder: [*play, folder / "store"], lambda folder: contents(folder / "store"))
+
+
 def comparison(config: Path) -> Scenario:
     """`forbes compare`, whose trainings are processes of their own."""
 
@@ -188,17 +195,16 @@ def trained(run: Path) -> dict[str, object]:
     """Give what a training must leave alike: weights, moments, metrics, episodes, and nothing besides."""
     checkpoint = read_checkpoint(RunFolder(run).checkpoint)
     kept = {part: checkpoint[part] for part in ("state_dict", "optimizer_states", "global_step")}
-    found: dict[str, object] = {
-        **{str(path.relative_to(run)): True for path in run.rglob("*") if not BESIDES & set(path.parts)},
-        "checkpoint": digest(kept),
-        "metrics": read_metrics(run).to_csv(),
-    }
-    if (episodes := run / "episodes").is_dir():
-        found |= {
-            f"content of {path.name}": hashlib.sha256(path.read_bytes()).hexdigest()
-            for path in sorted(episodes.glob("*.npz"))
-        }
-    return found
+    found = {str(path.relative_to(run)): True for path in run.rglob("*") if not BESIDES & set(path.parts)}
+    found |= {"checkpoint": digest(kept), "metrics": read_metrics(run).to_csv()}
+    return found | contents(run / "episodes")
+
+
+def contents(store: Path) -> dict[str, object]:
+    """Give the episodes of a store."""
+    return {
+        f"content of {path.name}": hashlib.sha256(path.read_bytes()).hexdigest() for path in store.glob("*.npz")
+    } | {f"of the index: {number}": str(record) for number, record in EpisodeStore(store).records.items()}
 
 
 def measured(run: Path) -> dict[str, object]:

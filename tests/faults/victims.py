@@ -12,7 +12,6 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 import traceback
 from collections.abc import Callable
@@ -65,27 +64,37 @@ def run(
         fault: what ends it.
         before: is called in the new process first.
     """
-    output, said = os.pipe()  # no file, since a limit of their size would hold for it too
-    fcntl.fcntl(said, fcntl.F_SETPIPE_SZ, 2**20)
-    os.set_blocking(output, False)
-    with tempfile.TemporaryFile() as operations, open(output, "rb") as reader:
-        process = os.fork()
-        if process == 0:
-            command = [str(argument) for argument in arguments]
-            _command(command, folder, fault, before, said, operations.fileno())
-        os.close(said)
-        status = os.waitstatus_to_exitcode(_wait(process, fault))
-        found = (reader.read() or b"").decode(errors="replace")
-        return Ending(status, found, _content(operations).splitlines(), left_over(process))
+    output, operations = _Pipe(), _Pipe()
+    process = os.fork()
+    if process == 0:
+        files = output.written, operations.written
+        _command([str(argument) for argument in arguments], folder, fault, before, *files)
+    status = os.waitstatus_to_exitcode(_wait(process, fault))
+    return Ending(status, output.content(), operations.content().splitlines(), left_over(process))
+
+
+class _Pipe:
+    """Holds what a process writes; it is no file, since a limit of their size would hold for it too."""
+
+    def __init__(self) -> None:
+        self.read, self.written = os.pipe()
+        fcntl.fcntl(self.written, fcntl.F_SETPIPE_SZ, 2**20)
+
+    def content(self) -> str:
+        """Return what was written, whoever may still write."""
+        os.close(self.written)
+        os.set_blocking(self.read, False)
+        with open(self.read, "rb") as reader:
+            return (reader.read() or b"").decode(errors="replace")
 
 
 def run_real(arguments: list[object], fault: Fault | None = None) -> Ending:
     """Run a command as a user does, start-up and all."""
-    with tempfile.TemporaryFile() as output:
-        command = [sys.executable, "-m", "forbes", *map(str, arguments)]
-        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
-        process.returncode = os.waitstatus_to_exitcode(_wait(process.pid, fault))
-        return Ending(process.returncode, _content(output), [], left_over(process.pid))
+    output = _Pipe()
+    command = [sys.executable, "-m", "forbes", *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=output.written, stderr=subprocess.STDOUT, start_new_session=True)
+    process.returncode = os.waitstatus_to_exitcode(_wait(process.pid, fault))
+    return Ending(process.returncode, output.content(), [], left_over(process.pid))
 
 
 def left_over(session: int) -> list[int]:
@@ -175,8 +184,3 @@ def _of_session(session: int) -> list[int]:
         if int(its_session) == session and state not in "ZX":
             found.append(int(path.parent.name))
     return found
-
-
-def _content(file) -> str:
-    file.seek(0)
-    return file.read().decode(errors="replace")
