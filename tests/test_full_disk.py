@@ -280,7 +280,7 @@ def weights_of(run):
     return sum(values.nbytes for values in state.values())
 
 
-@pytest.mark.parametrize(("share", "said"), [(0.9, "refused"), (1.1, "warned"), (8.9, "warned"), (9.1, "fits")])
+@pytest.mark.parametrize(("share", "said"), [(0.9, "refused"), (1.1, "warned"), (11.9, "warned"), (12.1, "fits")])
 def test_a_training_whose_checkpoints_will_not_fit_is_told_before_it_begins(
     share, said, tiny_config, tiny_run, tmp_path, monkeypatch, capsys
 ):
