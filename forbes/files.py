@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from forbes.errors import ForbesError, unwritable
 
 __all__ = ["append_whole", "drop_half_line", "fsync_folder", "locked", "no_link", "npz_bytes", "replace_file"]
-__all__ += ["require_no_links", "require_room", "writing"]
+__all__ += ["remove_halves", "require_no_links", "require_room", "writing"]
 
 
 @contextmanager
@@ -66,6 +66,16 @@ def replace_file(
             fsync_folder(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def remove_halves(folder: Path, *names: str) -> None:
+    """Remove what `replace_file` has left of files, or of patterns, in a process that was killed.
+
+    Call it where no other process can be writing these files.
+    """
+    for name in names:
+        for half in folder.glob(f".{name}.*"):
+            half.unlink()
 
 
 def append_whole(path: Path, content: bytes, sync: bool = False) -> None:

@@ -284,7 +284,7 @@ def weights_of(run):
 def test_a_training_whose_checkpoints_will_not_fit_is_told_before_it_begins(
     share, said, tiny_config, tiny_run, tmp_path, monkeypatch, capsys
 ):
-    """Three files, of the weights and two moments for each of them: refused where not even the weights fit."""
+    """Four files, of the weights and two moments for each of them: refused where not even the weights fit."""
     command = ["fit", "--config", str(tiny_config), "--run_dir", str(tmp_path / "run"), "--trainer.max_epochs", "1"]
     with free(monkeypatch, share * weights_of(tiny_run)), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -33,7 +33,7 @@ from forbes.data.episodes import (
     read_record,
 )
 from forbes.errors import ForbesError
-from forbes.files import drop_half_line, locked, replace_file
+from forbes.files import drop_half_line, locked, remove_halves, replace_file
 
 __all__ = ["EpisodeStore", "EpisodeWriter", "first_held"]
 
@@ -144,8 +144,7 @@ class EpisodeWriter(EpisodeStore):
         self._stack.enter_context(locked(self.path, "writes episodes here. Choose another folder"))
         lost = self.index.is_lost()
         drop_half_line(self.index.path)
-        for half in [*self.path.glob(".*.npz.*"), *self.path.glob(".index.jsonl.*")]:
-            half.unlink()
+        remove_halves(self.path, "*.npz", self.index.path.name)
         self.refresh()
         if lost:
             self._rebuild()

@@ -20,7 +20,7 @@ from torch import Tensor
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.scoring import Scores
-from forbes.files import no_link, replace_file
+from forbes.files import no_link, remove_halves, replace_file
 from forbes.reading import is_number, read_json, read_npz, shortened
 from forbes.training.run_folder import RunFolder
 
@@ -143,6 +143,7 @@ def write_record(run: str | Path, entries: dict[str, dict[str, Any]], totals: di
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / ".evaluation.lock", "a", opener=no_link) as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
+        remove_halves(folder, "evaluation.npz", "evaluation.json")
         record = read_record(run) | entries
         arrays = read_arrays(run) | {name: values.numpy() for name, values in totals.items()}
         content = io.BytesIO()

@@ -260,3 +260,4 @@ def _name_too(path: Path, name: str) -> None:
     except OSError:  # a file system without hard links
         shutil.copyfile(path, aside)
     aside.replace(path.with_name(name))
+    aside.unlink(missing_ok=True)  # a rename does nothing where both are names of one file already

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from forbes.errors import ForbesError
-from forbes.files import locked, require_no_links
+from forbes.files import locked, remove_halves, require_no_links
 from forbes.reading import is_number, read_yaml
 
 __all__ = ["RunFolder", "experiment_name", "read_config", "read_metrics"]
@@ -96,8 +96,8 @@ class RunFolder:
     def locked(self) -> Iterator[None]:
         """Keep every other process from training in this folder; the system frees it when the process dies."""
         with locked(self.path, "trains here. Choose another --run_dir"):
-            for half in self.checkpoint.parent.glob(".*.ckpt.*"):  # of a process that was killed while it saved
-                half.unlink()
+            remove_halves(self.path, self.config.name, self.provenance.name, self.failure.name)
+            remove_halves(self.checkpoint.parent, "*.ckpt")
             yield
 
 

@@ -58,6 +58,15 @@ def test_a_kill_at_any_step_of_saving_leaves_the_old_checkpoint_whole(path, monk
     assert {file.name for file in path.parent.iterdir()} == {"last.ckpt", "previous.ckpt"}
 
 
+def test_a_checkpoint_that_is_the_previous_one_too_leaves_no_third_name(path):
+    """A rename of one name of a file to another does nothing, and keeps both."""
+    path.with_name("previous.ckpt").hardlink_to(path)  # as after a kill between the two renames
+
+    AtomicCheckpointIO().save_checkpoint(NEW, path)
+
+    assert {file.name for file in path.parent.iterdir()} == {"last.ckpt", "previous.ckpt"}
+
+
 def test_a_real_kill_leaves_a_whole_checkpoint(tmp_path):
     program = """
 import sys, itertools, pathlib, torch

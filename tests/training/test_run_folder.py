@@ -29,6 +29,18 @@ def test_runs_that_start_in_the_same_second_have_folders_of_their_own(in_tmp_pat
     assert all(folder.is_dir() for folder in folders)
 
 
+def test_what_a_killed_process_has_left_half_written_is_removed(tmp_path):
+    halves = [".config.yaml.0f", ".provenance.json.0f", "checkpoints/.last.ckpt.0f", "checkpoints/.best.ckpt.part"]
+    for name in [*halves, ".evaluation.json.0f"]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+
+    with RunFolder(tmp_path).locked():
+        left = {path.name for path in tmp_path.rglob("*") if path.is_file()}
+
+    assert left == {".lock", ".evaluation.json.0f"}  # another process may be writing this
+
+
 def test_a_second_process_cannot_enter_a_run_folder(tmp_path):
     with RunFolder(tmp_path).locked():
         with pytest.raises(ForbesError, match=r"process \d+ on .* trains here"), RunFolder(tmp_path).locked():
