@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import elu, relu
 
+from forbes.configured import Configurable
 from forbes.deferred import Loop
 from forbes.errors import ForbesError
 from forbes.fusion import Elementwise, fused
@@ -80,7 +81,7 @@ def _gate(of_hidden: Tensor, of_x: Tensor, hidden: Tensor) -> Tensor:
     return torch.lerp(torch.addcmul(new_x, reset, new_h).tanh(), hidden, update)
 
 
-class Encoder(nn.Module):
+class Encoder(Configurable, nn.Module):
     """e_t = encoder(o_t): images `(N, C, H, W)`, or vectors `(N, O)`, to embeddings `(N, E)`.
 
     Attributes:
@@ -90,7 +91,7 @@ class Encoder(nn.Module):
     embedding_dim: int
 
 
-class Decoder(nn.Module):
+class Decoder(Configurable, nn.Module):
     """Features `(N, F)` to the likelihood's parameters, in the observation's shape."""
 
 

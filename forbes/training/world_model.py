@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, TypeAlias, cast
+from typing import Any, Literal, NamedTuple, Self, TypeAlias, cast
 
 import torch
 from lightning import LightningModule
@@ -11,7 +11,7 @@ from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from forbes.beliefs import BeliefFamily, FlowBelief
-from forbes.data import SequenceBatch
+from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel, ModelFamily
 from forbes.models.elbo import KL, ElboTerms, FreeNats, elbo_loss
@@ -19,6 +19,7 @@ from forbes.models.likelihoods import Likelihood, Normal, VectorNormal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
+from forbes.training.defaults import defaults_for
 from forbes.training.divergence import hold_unless_finite
 
 __all__ = ["Group", "Objective", "WorldModel", "batches_before", "follow_rates", "require_at_least", "together"]
@@ -125,6 +126,19 @@ class WorldModel(LightningModule):
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.learning_rate, self.schedule, self.warmup = learning_rate, schedule, warmup
         self.clip_norm, self.seed = clip_norm, seed
+
+    @classmethod
+    def for_data(cls, data: SequenceDataModule, **options: Any) -> Self:
+        """Build a model for these data: their shapes and seed, and networks and a likelihood that fit them.
+
+        Args:
+            data: with the source that the model is to learn.
+            **options: arguments of the constructor by name. What is not given is as in `configs/` for such data (see
+                `defaults_for`).
+        """
+        of_data = {"observation_shape": data.observation_shape, "action_dim": data.action_dim, "seed": data.seed}
+        arguments: dict[str, Any] = of_data | defaults_for(data.source) | options
+        return cls(**arguments)
 
     @property
     def objective_name(self) -> str:
