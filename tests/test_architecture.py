@@ -21,7 +21,7 @@ FOUNDATION = {
     "named",
     "precision",
 }
-FOUNDATION |= {"parsers", "reading", "shapes"}
+FOUNDATION |= {"parsers", "reading", "shapes", "signatures"}
 BENEATH = {"beliefs", "data", "envs", "models", "control", "pomdps"}  # what training knows
 MAY_IMPORT = {  # besides itself and the foundation
     **{part: set() for part in (*FOUNDATION, "beliefs", "pomdps")},

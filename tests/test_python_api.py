@@ -1,6 +1,7 @@
 """`import forbes`: what it gives, when it imports it, and the ten lines that train a model."""
 
 import ast
+import inspect
 import subprocess
 import sys
 import warnings
@@ -162,3 +163,107 @@ def test_an_agent_for_data_knows_whether_actions_are_discrete():
     assert agent.discrete
     assert agent.model.action_dim == 3
     assert type(agent.model.likelihood) is forbes.OneHot
+
+
+@pytest.fixture
+def trained(world, digits, in_tmp_path):
+    """The checkpoint that a plain trainer leaves of it."""
+    trainer = plain_trainer(max_epochs=1)
+    fit(trainer, world, digits)
+    trainer.save_checkpoint("plain.ckpt")
+    return Path("plain.ckpt")
+
+
+def same_weights(one, other):
+    torch.testing.assert_close(dict(one.state_dict()), dict(other.state_dict()), rtol=0, atol=0)
+
+
+def test_a_model_is_loaded_from_the_checkpoint_of_a_run(tiny_run):
+    world = forbes.WorldModel.load_from_checkpoint(tiny_run / "checkpoints" / "last.ckpt")
+
+    same_weights(world, forbes.load_run(tiny_run)[0])
+    assert world.training
+    assert (world.seed, world.learning_rate) == (0, 5e-4)
+
+
+def test_arguments_take_the_place_of_those_of_a_run(tiny_run):
+    checkpoint = tiny_run / "checkpoints" / "last.ckpt"
+
+    assert forbes.WorldModel.load_from_checkpoint(checkpoint, learning_rate=1e-3).learning_rate == 1e-3
+    with pytest.raises(forbes.ForbesError, match=r"config\.yaml: model\.learnin_rate: .*did you mean learning_rate\?"):
+        forbes.WorldModel.load_from_checkpoint(checkpoint, learnin_rate=1e-3)
+    with pytest.raises(forbes.ForbesError, match="a run of WorldModel, expected one of ImaginationActorCritic"):
+        forbes.ImaginationActorCritic.load_from_checkpoint(checkpoint)
+
+
+def test_a_model_is_loaded_from_the_checkpoint_of_a_plain_trainer(trained, world):
+    loaded = forbes.WorldModel.load_from_checkpoint(trained)
+
+    same_weights(loaded, world)
+    assert type(loaded.model.likelihood) is forbes.OnePixel
+    assert (loaded.kl_warmup, loaded.schedule, loaded.seed) == (500, "cosine", 0)
+
+
+def test_arguments_of_any_kind_take_the_place_of_those_of_a_plain_trainer(trained, digits, world):
+    belief = forbes.FlowBelief.configured(layers=2, width=4, min_std=0.2)
+
+    loaded = forbes.WorldModel.load_from_checkpoint(trained, belief=belief, warmup=7)
+
+    same_weights(loaded, world)
+    assert loaded.model.prior.base.min_std == 0.2
+    assert loaded.warmup == 7
+
+
+def test_a_checkpoint_of_a_plain_trainer_with_other_sizes_is_one_sentence(trained):
+    with pytest.raises(forbes.ForbesError, match=r"plain\.ckpt: its model\.\S+ is .*that of the configured model"):
+        forbes.WorldModel.load_from_checkpoint(trained, hidden_dim=9)
+
+
+def test_a_checkpoint_that_names_a_foreign_class_is_refused(trained):
+    content = torch.load(trained, weights_only=True)
+    content["hyper_parameters"]["belief"] = {"class_path": "subprocess.Popen", "init_args": {"args": ["true"]}}
+    torch.save(content, trained)
+
+    with pytest.raises(forbes.ForbesError, match=r"plain\.ckpt: model\.belief: subprocess\.Popen is not a class of"):
+        forbes.WorldModel.load_from_checkpoint(trained)
+
+
+def test_arguments_in_a_checkpoint_that_are_no_mapping_are_one_sentence(trained):
+    torch.save(torch.load(trained, weights_only=True) | {"hyper_parameters": [1]}, trained)
+
+    with pytest.raises(forbes.ForbesError, match=r"plain\.ckpt: its hyper_parameters are a list, expected"):
+        forbes.WorldModel.load_from_checkpoint(trained)
+
+
+def test_the_arguments_of_every_kind_of_data_survive_a_checkpoint(tmp_path):
+    for name, source in CONFIGURED.items():
+        data = forbes.SequenceDataModule(source())
+        world = forbes.WorldModel.for_data(data, model=forbes.ParticleModel.configured(particles=3), kl="monte_carlo")
+        content = {"state_dict": world.state_dict(), "global_step": 0, "hyper_parameters": dict(world.hparams)}
+        torch.save(content, tmp_path / "x")
+
+        loaded = forbes.WorldModel.load_from_checkpoint(tmp_path / "x")
+
+        same_weights(loaded, world)
+        assert dict(loaded.hparams) == dict(world.hparams), name
+        assert vars(loaded.model.likelihood) == vars(world.model.likelihood)
+        assert (loaded.kl, loaded.model.particles) == ("monte_carlo", 3)
+
+
+def test_the_signature_of_an_agent_has_every_option():
+    agent = inspect.signature(forbes.ImaginationActorCritic).parameters
+    world = inspect.signature(forbes.WorldModel).parameters
+
+    assert [*agent][:2] == ["trajectories", "horizon"]
+    assert {*world, "control_dim", "reward_std", "exploration"} < {*agent}
+    assert all(agent[name].default == world[name].default for name in world)
+    assert not [one for one in agent.values() if one.kind is inspect.Parameter.VAR_KEYWORD]
+
+
+@pytest.mark.parametrize("kind", [forbes.ImaginationActorCritic, forbes.PlanningAgent])
+def test_an_agent_takes_what_its_signature_says(kind):
+    arguments = {name: one.default for name, one in inspect.signature(kind).parameters.items()}
+
+    kind(**arguments | {"action_dim": 2, "hidden_dim": 8, "control_dim": 8})
+    with pytest.raises(TypeError, match="unexpected keyword argument 'horizons'"):
+        kind(action_dim=2, horizons=3)
