@@ -1,7 +1,10 @@
 """`import forbes`: what it gives, when it imports it, and the ten lines that train a model."""
 
 import ast
+import doctest
 import inspect
+import operator
+import shutil
 import subprocess
 import sys
 import warnings
@@ -267,3 +270,24 @@ def test_an_agent_takes_what_its_signature_says(kind):
     kind(**arguments | {"action_dim": 2, "hidden_dim": 8, "control_dim": 8})
     with pytest.raises(TypeError, match="unexpected keyword argument 'horizons'"):
         kind(action_dim=2, horizons=3)
+
+
+@pytest.fixture(scope="module")
+def workplace(tiny_run, tmp_path_factory):
+    """A folder with what the examples read: a run, and episodes of a tiger."""
+    folder = tmp_path_factory.mktemp("workplace")
+    shutil.copytree(tiny_run, folder / "runs" / "forbes-0")
+    assert main(["data", "collect", "--task", "tiger", "--episodes", "20", "-o", str(folder / "episodes/tiger")]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("name", [*NAMES, "configured.Configurable"])
+def test_the_example_of_a_public_name_gives_what_it_says(name, workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    value = operator.attrgetter(name)(forbes)
+    (example,) = doctest.DocTestFinder(recurse=False).find(value, name, globs={"forbes": forbes, "torch": torch})
+    assert len(example.examples) > 0
+
+    found = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example)
+
+    assert found.failed == 0

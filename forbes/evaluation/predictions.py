@@ -38,6 +38,14 @@ def filter(model: BeliefModel, batch: SequenceBatch, samples: int = 1) -> State:
 
     Returns:
         h, shape `(N B, H)`, and s, shape `(N B, D)`, sample-major: sample n of sequence b is in row n B + b.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> model = forbes.WorldModel.for_data(data).model
+        >>> batch = data.sequences("test", torch.arange(8))
+        >>> belief = forbes.filter(model, batch, samples=10)
+        >>> belief.hidden.shape, belief.state.shape
+        (torch.Size([80, 200]), torch.Size([80, 8]))
     """
     return model.beliefs(model.see(batch.observation, batch.action), samples)
 
@@ -58,6 +66,14 @@ def imagine(model: BeliefModel, belief: State, action: Tensor) -> Rollout:
 
     Raises:
         ForbesError: where the belief does not have a whole number of samples per sequence.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> model = forbes.WorldModel.for_data(data).model
+        >>> batch = data.sequences("test", torch.arange(8))
+        >>> rollout = forbes.imagine(model, forbes.filter(model, batch, samples=10), action=torch.zeros(8, 5, 0))
+        >>> model.likelihood.sample(model.decode(rollout.features)).shape
+        torch.Size([80, 5, 1, 28, 28])
     """
     samples, rest = divmod(len(belief.hidden), len(action))
     if rest:
@@ -85,6 +101,13 @@ def complete(
         context: steps that the model sees.
         samples: N.
         mean: of increments, take the expectation in the place of a draw: how likely each pixel is on, in grey.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> model = forbes.WorldModel.for_data(data).model
+        >>> batch = data.sequences("test", torch.arange(8))
+        >>> forbes.complete(model, data.source, batch, context=15, samples=10).frames.shape
+        torch.Size([10, 8, 15, 1, 28, 28])
     """
     sequences = len(batch.observation)
     start = model.beliefs(model.see(batch.observation[:, :context], batch.action[:, :context]), samples)  # (N B, ...)

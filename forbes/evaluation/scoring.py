@@ -131,6 +131,13 @@ def evaluate(
 
     Raises:
         ForbesError: for a score that does not exist, fewer than two sequences, or a score that is not finite.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> model = forbes.WorldModel.for_data(data).model
+        >>> scores = forbes.evaluate(model, data, scores=["elbo"], sequences=10, samples=2)
+        >>> sorted(scores)
+        ['elbo', 'kl', 'reconstruction']
     """
     if unknown := [name for name in scores if name not in PASSES]:
         raise ForbesError(f"evaluate: there is no score {unknown[0]}, expected some of {', '.join(PASSES)}")

@@ -55,6 +55,11 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
     Raises:
         ForbesError: when the folder holds no trained run or one of another kind, or its configuration and its
             checkpoint do not fit together.
+
+    Example:
+        >>> world, data = forbes.load_run("runs/forbes-0")  # forbes fit --run_dir runs/forbes-0 --config ...
+        >>> world.terms(data.sequences("test", torch.arange(8))).elbo.shape
+        torch.Size([8])
     """
     loaded = open_run(run)
     return loaded.module, loaded.data

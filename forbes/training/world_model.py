@@ -77,6 +77,13 @@ class WorldModel(LightningModule):
     Raises:
         ForbesError: when a size is below 1, the learning rate or `clip_norm` below 0, or `likelihood` or `center` does
             not fit.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> world = forbes.WorldModel.for_data(data, belief=forbes.FlowBelief.configured(layers=3))
+        >>> batch = data.sequences("test", torch.arange(8))
+        >>> world.terms(batch).elbo.shape  # train it with Trainer().fit(world, data)
+        torch.Size([8])
     """
 
     def __init__(
