@@ -11,6 +11,7 @@ import warnings
 from pathlib import Path
 
 import lightning
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -229,6 +230,21 @@ def test_a_checkpoint_that_names_a_foreign_class_is_refused(trained):
 
     with pytest.raises(forbes.ForbesError, match=r"plain\.ckpt: model\.belief: subprocess\.Popen is not a class of"):
         forbes.WorldModel.load_from_checkpoint(trained)
+
+
+def test_what_a_checkpoint_cannot_name_has_to_be_given_again(digits, tmp_path):
+    def belief(state_dim, context_dim):
+        return forbes.FlowBelief(state_dim, context_dim, layers=2, width=4)
+
+    world = forbes.WorldModel.for_data(digits, belief=belief, hidden_dim=np.int64(8), learning_rate=np.float64(1e-3))
+    content = {"state_dict": world.state_dict(), "global_step": 0, "hyper_parameters": dict(world.hparams)}
+    torch.save(content, tmp_path / "x")
+
+    with pytest.raises(forbes.ForbesError, match=r"x: model\.belief: "):
+        forbes.WorldModel.load_from_checkpoint(tmp_path / "x")
+    loaded = forbes.WorldModel.load_from_checkpoint(tmp_path / "x", belief=belief)
+    same_weights(loaded, world)
+    assert loaded.learning_rate == 1e-3
 
 
 def test_arguments_in_a_checkpoint_that_are_no_mapping_are_one_sentence(trained):

@@ -4,11 +4,13 @@ import argparse
 import inspect
 from collections.abc import Mapping
 from functools import partial
+from numbers import Integral, Real
 from typing import Any
 
 from lightning.pytorch.cli import LightningArgumentParser
 
 from forbes.errors import ForbesError
+from forbes.models import Likelihood
 from forbes.training.config_errors import building, one_sentence
 from forbes.training.configuration import allow_modules, require_classes
 
@@ -46,22 +48,25 @@ def build_arguments(kind: type, plain: Mapping[str, Any], where: str) -> dict[st
 
 
 def _plain(value: Any) -> Any:
-    """Return one argument: plain values as they are, tuples as lists, a class, its `partial` or its object by name."""
+    """Return one argument: numbers and words as they are, tuples as lists, all else by the name of its class.
+
+    What cannot be built by its name, such as a lambda, is refused by `build_arguments`, and has to be given again.
+    """
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, Real):  # of numpy, too
+        return int(value) if isinstance(value, Integral) else float(value)
     if isinstance(value, tuple | list):
         return [_plain(each) for each in value]
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, type):
-        return {"class_path": _path(value)}
     if isinstance(value, partial):
         return {"class_path": _path(value.func), "init_args": plain_arguments(value.keywords)}
-    names = [name for name in inspect.signature(type(value)).parameters if hasattr(value, name)]
-    return {
-        "class_path": _path(type(value)),
-        "init_args": plain_arguments({name: getattr(value, name) for name in names}),
-    }
+    if isinstance(value, Likelihood):
+        names = [name for name in inspect.signature(type(value)).parameters if hasattr(value, name)]
+        options = {name: getattr(value, name) for name in names}
+        return {"class_path": _path(type(value)), "init_args": plain_arguments(options)}
+    return {"class_path": _path(value if hasattr(value, "__qualname__") else type(value))}
 
 
 def _path(kind: Any) -> str:
-    """Return where a class can be imported from."""
+    """Return where a class or a function can be imported from."""
     return f"{kind.__module__}.{kind.__qualname__}"
