@@ -18,6 +18,12 @@ class ForbesError(Exception):
 
     The message is one clear sentence: where, what, what was expected, what to do. The command line prints it
     as ``forbes: <message>`` and exits with `exit_status`; ``--debug`` shows the traceback.
+
+    Example:
+        >>> forbes.Strokes(points_per_step=0)
+        Traceback (most recent call last):
+        ...
+        forbes.errors.ForbesError: Strokes: points_per_step is 0, expected at least 1.
     """
 
     exit_status = 2

@@ -8,8 +8,20 @@ import pytest
 FORBES = Path(__file__).parents[1] / "forbes"
 MODULES = sorted(FORBES.rglob("*.py"))
 
-FOUNDATION = {"child", "errors", "files", "seeding", "arguments", "deferred", "frozen", "fusion", "named", "precision"}
-FOUNDATION |= {"parsers", "reading", "shapes"}
+FOUNDATION = {
+    "child",
+    "errors",
+    "files",
+    "seeding",
+    "arguments",
+    "configured",
+    "deferred",
+    "frozen",
+    "fusion",
+    "named",
+    "precision",
+}
+FOUNDATION |= {"parsers", "reading", "shapes", "signatures"}
 BENEATH = {"beliefs", "data", "envs", "models", "control", "pomdps"}  # what training knows
 MAY_IMPORT = {  # besides itself and the foundation
     **{part: set() for part in (*FOUNDATION, "beliefs", "pomdps")},
@@ -25,7 +37,7 @@ MAY_IMPORT = {  # besides itself and the foundation
     "parsers": {"envs"},  # names of tasks; nothing that imports torch
     "cli": set(),
     "__main__": {"cli"},
-    "__init__": set(),
+    "__init__": BENEATH | {"training", "evaluation"},  # the Python API, imported when it is asked for
 }
 
 

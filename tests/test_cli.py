@@ -97,7 +97,7 @@ def test_the_examples_of_its_help_can_be_run(example, monkeypatch, capsys):
         main([*example.split(), "--print_config"])
 
     assert done.value.code == 0
-    assert "class_path: forbes.training.WorldModel" in capsys.readouterr().out
+    assert "class_path: forbes.WorldModel" in capsys.readouterr().out
 
 
 def test_what_its_help_says_people_change_has_the_values_of_the_first_example(monkeypatch, capsys):
@@ -311,7 +311,7 @@ def test_a_run_folder_is_named_after_its_configuration_and_holds_all_of_the_run(
     assert f"run folder: {run}" in capsys.readouterr().out
     config = yaml.safe_load((run / "config.yaml").read_text())
     assert config["seed_everything"] == 7
-    assert config["model"]["class_path"] == "forbes.training.WorldModel"
+    assert config["model"]["class_path"] == "forbes.WorldModel"
     assert config["model"]["init_args"]["clip_norm"] == 100.0  # a default: the file holds all
     (start,) = json.loads((run / "provenance.json").read_text())
     assert start["seed"] == 7

@@ -60,7 +60,7 @@ def test_a_configuration_of_another_kind_is_one_sentence(command, content, tiny_
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("class_path: forbes.beliefs.FlowBelief", "class_path: ''"),
+        ("class_path: forbes.FlowBelief", "class_path: ''"),
         ("layers: 2", "layers: -3"),
         ("width: 8", "width: -1"),
     ],

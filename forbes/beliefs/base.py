@@ -6,6 +6,7 @@ from typing import ClassVar, TypeAlias
 
 from torch import Tensor, nn
 
+from forbes.configured import Configurable
 from forbes.deferred import Loop
 from forbes.frozen import frozen
 
@@ -14,7 +15,7 @@ __all__ = ["BeliefFamily", "BeliefHead", "Sampler"]
 Sampler: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
-class BeliefHead(nn.Module, ABC):
+class BeliefHead(Configurable, nn.Module, ABC):
     r"""A conditional density :math:`p(s \mid c)` over the state given a context (DESIGN §4).
 
     The context is the hidden layer of the network that reads the history: shape `(*, C)`. A family knows neither the
@@ -72,4 +73,4 @@ class BeliefHead(nn.Module, ABC):
 
 
 BeliefFamily: TypeAlias = Callable[[int, int], BeliefHead]
-"""Builds a head from (state_dim, context_dim): a class of this package with its other arguments bound."""
+"""Builds a head from (state_dim, context_dim): a class of this package, or `FlowBelief.configured(layers=3)`."""

@@ -27,6 +27,12 @@ class CategoricalBelief(BeliefHead):
 
     Raises:
         ForbesError: when `state_dim` is no multiple of `classes`, or `kl_balance` is outside [0, 1].
+
+    Example:
+        >>> belief = forbes.CategoricalBelief(state_dim=2, context_dim=8, classes=2)
+        >>> state, log_prob = belief.rsample(torch.zeros(5, 8), sample_shape=(100,))
+        >>> state.shape, log_prob.shape
+        (torch.Size([100, 5, 2]), torch.Size([100, 5]))
     """
 
     reparameterised = False

@@ -31,6 +31,12 @@ class FlowBelief(BeliefHead):
         min_std: smallest standard deviation of the base, the same as the Gaussian belief's.
         coupling: "affine" is the paper's; "spline" also splits a one-dimensional state (Durkan et al., 2019).
         bins: of each spline; 8 as in Durkan et al.
+
+    Example:
+        >>> belief = forbes.FlowBelief(state_dim=2, context_dim=8, layers=3)
+        >>> state, log_prob = belief.rsample(torch.zeros(5, 8), sample_shape=(100,))
+        >>> state.shape, log_prob.shape
+        (torch.Size([100, 5, 2]), torch.Size([100, 5]))
     """
 
     def __init__(

@@ -27,6 +27,12 @@ class GaussianBelief(BeliefHead):
         state_dim: D.
         context_dim: C.
         min_std: smallest standard deviation; 0.1 as in PlaNet and Dreamer.
+
+    Example:
+        >>> belief = forbes.GaussianBelief(state_dim=2, context_dim=8)
+        >>> state, log_prob = belief.rsample(torch.zeros(5, 8), sample_shape=(100,))
+        >>> state.shape, log_prob.shape
+        (torch.Size([100, 5, 2]), torch.Size([100, 5]))
     """
 
     def __init__(self, state_dim: int, context_dim: int, min_std: float = 0.1) -> None:

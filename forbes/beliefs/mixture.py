@@ -52,6 +52,12 @@ class MixtureBelief(BeliefHead):
         context_dim: C.
         components: M.
         min_std: smallest standard deviation, the same as the Gaussian belief's.
+
+    Example:
+        >>> belief = forbes.MixtureBelief(state_dim=2, context_dim=8, components=3)
+        >>> state, log_prob = belief.rsample(torch.zeros(5, 8), sample_shape=(100,))
+        >>> state.shape, log_prob.shape
+        (torch.Size([100, 5, 2]), torch.Size([100, 5]))
     """
 
     def __init__(self, state_dim: int, context_dim: int, components: int = 5, min_std: float = 0.1) -> None:

@@ -65,6 +65,12 @@ class SequenceDataModule(LightningDataModule):
 
     Raises:
         ForbesError: when `length` or `batch_size` is below 1, or a batch is larger than its split.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), batch_size=4, length=30)
+        >>> compact = next(iter(data.train_dataloader()))
+        >>> data.on_after_batch_transfer(compact, 0).observation.shape
+        torch.Size([4, 30, 1, 28, 28])
     """
 
     def __init__(

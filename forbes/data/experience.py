@@ -35,6 +35,12 @@ class Experience(SequenceSource):
 
     Raises:
         ForbesError: for an unknown task or option, a timeout that is not above 0, or a time_limit below 1.
+
+    Example:
+        >>> source = forbes.Experience("gymnasium:CartPole-v1", options={"action_repeat": 2})
+        >>> source.observation_shape, source.action_dim, source.discrete
+        ((4,), 2, True)
+        >>> source.close()
     """
 
     def __init__(

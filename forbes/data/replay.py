@@ -65,6 +65,12 @@ class Replay(SequenceSource):
 
     Raises:
         ForbesError: where the store is empty or its index damaged, or a number is not what it can be.
+
+    Example:
+        >>> source = forbes.Replay("episodes/tiger")  # forbes data collect --task tiger --episodes 20 -o episodes/tiger
+        >>> data = forbes.SequenceDataModule(source, length=10)
+        >>> data.sequences("train", torch.arange(3)).reward.shape
+        torch.Size([3, 10])
     """
 
     def __init__(self, path: str, capacity: int | None = None, hold_out: int = 10, stride: int = 50) -> None:

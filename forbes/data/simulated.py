@@ -40,6 +40,13 @@ class Simulated(SequenceSource):
 
     Raises:
         ForbesError: when a split would be empty.
+
+    Example:
+        >>> source = forbes.Simulated(forbes.MirrorSensor(), train=100)
+        >>> data = forbes.SequenceDataModule(source, length=20)
+        >>> batch = data.sequences("train", torch.arange(5))
+        >>> batch.observation.shape, batch.state.shape
+        (torch.Size([5, 20, 1]), torch.Size([5, 20, 1]))
     """
 
     def __init__(

@@ -19,7 +19,16 @@ __all__ = ["SequenceBatch", "SequenceSource", "Split", "check_batch", "check_sou
 
 @printed_by_shape
 class SequenceBatch(NamedTuple):
-    """Sequences, batch first. Index t holds (o_t, a_{t-1}, r_t): the action that led to o_t, zero at the start."""
+    """Sequences, batch first. Index t holds (o_t, a_{t-1}, r_t): the action that led to o_t, zero at the start.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> batch = data.sequences("test", torch.arange(8))
+        >>> batch.observation.shape, batch.action.shape
+        (torch.Size([8, 30, 1, 28, 28]), torch.Size([8, 30, 0]))
+        >>> batch.mask.sum(1)  # steps of each digit
+        tensor([29, 30, 19, 30, 30, 17, 30, 29])
+    """
 
     observation: Tensor
     """o_t, uint8 (B, T, C, H, W) for images, float32 (B, T, O) for vectors."""

@@ -58,6 +58,13 @@ class Strokes(SequenceSource):
         frames: ``written``, what each step adds: at one point a step one pixel, or none where the pen crosses its own
             path. ``whole``, the paper's, show the first t points; their likelihood is mostly that of the past, drawn
             again.
+
+    Example:
+        >>> source = forbes.Strokes(frames="whole")
+        >>> source.size("test"), source.observation_shape
+        (10000, (1, 28, 28))
+        >>> source.steps("test")[:3]  # until each digit is whole
+        tensor([29, 37, 19])
     """
 
     observation_shape = (1, SIDE, SIDE)

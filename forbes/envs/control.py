@@ -46,6 +46,13 @@ class DeepMindControl(Environment):
 
     Raises:
         ForbesError: for an unknown task or camera, one without bounds of its actions, or when nothing renders.
+
+    Example:
+        >>> environment = forbes.DeepMindControl("cartpole_swingup", pixels=False)
+        >>> environment.reset(seed=0).observation.shape
+        (5,)
+        >>> environment.step(torch.zeros(1).numpy()).truncated
+        False
     """
 
     def __init__(

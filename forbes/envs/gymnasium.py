@@ -36,6 +36,13 @@ class Gymnasium(Environment):
     Raises:
         ForbesError: for an unknown id, a space of actions or observations that is none of these, or where gymnasium is
             missing.
+
+    Example:
+        >>> environment = forbes.Gymnasium("CartPole-v1")
+        >>> environment.reset(seed=0).observation.shape
+        (4,)
+        >>> environment.step(torch.tensor([1.0, 0.0]).numpy()).reward
+        1.0
     """
 
     def __init__(

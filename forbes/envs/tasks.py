@@ -60,6 +60,11 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
     Raises:
         ForbesError: where no environment can be meant, it has no such option, or it is of a module of Gymnasium's
             that nobody has allowed.
+
+    Example:
+        >>> make = forbes.find_environment("tiger")
+        >>> make().reset(seed=0).observation.shape
+        (2,)
     """
     own = {kind.__name__: kind for kind in _descendants(Environment) if not kind.__module__.startswith("forbes.")}
     make: Callable[..., Environment]

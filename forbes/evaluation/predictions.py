@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Split, Strokes
-from forbes.models import BeliefModel, StateSpaceModel
+from forbes.errors import ForbesError
+from forbes.models import BeliefModel, Rollout, State, StateSpaceModel
 from forbes.shapes import printed_by_shape
 
-__all__ = ["Completions", "complete", "first_of_each_class", "open_loop", "whole_sequences"]
+__all__ = ["Completions", "complete", "filter", "first_of_each_class", "imagine", "open_loop", "whole_sequences"]
 
 
 @printed_by_shape
@@ -24,6 +25,63 @@ class Completions(NamedTuple):
     def at(self, time: int) -> Tensor:
         """Give the frames of step `time`, counted from 1 as in the paper, `(N, B, C, H, W)`."""
         return self.frames[:, :, time - self.context - 1]
+
+
+@torch.no_grad()
+def filter(model: BeliefModel, batch: SequenceBatch, samples: int = 1) -> State:
+    """Sample the belief over (h, s) after the last step of each sequence, given all its observations and actions.
+
+    Args:
+        model: on the batch's device, `world.model` of a `WorldModel`.
+        batch: B sequences of T steps. Padding is not left out: cut sequences that end earlier.
+        samples: number of samples per sequence, N, from torch's global generator.
+
+    Returns:
+        h, shape `(N B, H)`, and s, shape `(N B, D)`, sample-major: sample n of sequence b is in row n B + b.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> model = forbes.WorldModel.for_data(data).model
+        >>> batch = data.sequences("test", torch.arange(8))
+        >>> belief = forbes.filter(model, batch, samples=10)
+        >>> belief.hidden.shape, belief.state.shape
+        (torch.Size([80, 200]), torch.Size([80, 8]))
+    """
+    return model.beliefs(model.see(batch.observation, batch.action), samples)
+
+
+@torch.no_grad()
+def imagine(model: BeliefModel, belief: State, action: Tensor) -> Rollout:
+    """Roll samples of the belief on without observations, each on its own trajectory.
+
+    Args:
+        model: on the device of the belief, `world.model` of a `WorldModel`.
+        belief: N samples for each of B sequences, as `filter` returns them.
+        action: the action that leads to each step, shape `(B, T, A)`, the same for all N samples of a sequence. A
+            process without actions has A = 0: `torch.zeros(B, T, 0)`.
+
+    Returns:
+        T steps after `belief`, shape `(N B, T, ...)`. `model.decode(rollout.features)` gives the parameters of the
+        likelihood, of which `model.likelihood` gives mean, sample and log-density.
+
+    Raises:
+        ForbesError: where the belief does not have a whole number of samples per sequence.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> model = forbes.WorldModel.for_data(data).model
+        >>> batch = data.sequences("test", torch.arange(8))
+        >>> rollout = forbes.imagine(model, forbes.filter(model, batch, samples=10), action=torch.zeros(8, 5, 0))
+        >>> model.likelihood.sample(model.decode(rollout.features)).shape
+        torch.Size([80, 5, 1, 28, 28])
+    """
+    samples, rest = divmod(len(belief.hidden), len(action))
+    if rest:
+        raise ForbesError(
+            f"imagine: the belief has {len(belief.hidden)} rows, expected a multiple of the {len(action)} sequences of "
+            "action. Give the actions of all sequences, once"
+        )
+    return model.imagine(belief, action.repeat(samples, 1, 1))  # action (N B, T, A)
 
 
 @torch.no_grad()
@@ -43,6 +101,13 @@ def complete(
         context: steps that the model sees.
         samples: N.
         mean: of increments, take the expectation in the place of a draw: how likely each pixel is on, in grey.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> model = forbes.WorldModel.for_data(data).model
+        >>> batch = data.sequences("test", torch.arange(8))
+        >>> forbes.complete(model, data.source, batch, context=15, samples=10).frames.shape
+        torch.Size([10, 8, 15, 1, 28, 28])
     """
     sequences = len(batch.observation)
     start = model.beliefs(model.see(batch.observation[:, :context], batch.action[:, :context]), samples)  # (N B, ...)

@@ -4,7 +4,7 @@ import hashlib
 import io
 import shutil
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -14,18 +14,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forbes.data import SequenceBatch
+from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
 from forbes.evaluation.bounds import Increments, score_predictions, score_trajectories
+from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.open_loop import score_open_loop
+from forbes.evaluation.runs import split_batches
 from forbes.evaluation.smc import score_particles
 from forbes.files import replace_file
 from forbes.models import BeliefModel, StateSpaceModel
+from forbes.parsers.evaluate import PASSES, SUBSET
 from forbes.pomdps import Process
 from forbes.reading import read_npz
 from forbes.seeding import derive_seed
 
-__all__ = ["Parts", "Pass", "Scores", "exact_pass", "make_pass", "require_finite", "score_split"]
+__all__ = ["Parts", "Pass", "Scores", "evaluate", "exact_pass", "make_pass", "require_finite", "score_split"]
 
 
 class Pass(NamedTuple):
@@ -92,6 +95,62 @@ def make_pass(name: str, number: int, batch_size: int, context: int) -> Pass:
         return Pass(("fivo", "ess"), f"K={number}", partial(score_particles, number=number), rows)
     metrics, function = ("open_loop", "open_loop_marginal"), partial(score_open_loop, number=number, context=context)
     return Pass(metrics, f"K={number},c={context}", function, batch_size, context)
+
+
+def evaluate(
+    model: BeliefModel,
+    data: SequenceDataModule,
+    scores: Sequence[str] = ("elbo", "pll"),
+    split: Split = "test",
+    sequences: int = SUBSET,
+    samples: int = 16,
+    particles: int = 128,
+    futures: int = 1000,
+    context: int = 15,
+    batch_size: int = 250,
+    seed: int = 0,
+) -> dict[str, Estimate]:
+    """Score a model, trained or not, on the first sequences of a split, as `forbes evaluate` does for a run.
+
+    Args:
+        model: `world.model` of a `WorldModel`; its device is where the scores are computed.
+        data: of the sequences.
+        scores: of elbo, pll, fivo and open-loop. Each gives several metrics: elbo its parts, pll the IWAE bound too,
+            fivo the effective sample size, open-loop its marginals. A `VectorModel` has no bounds.
+        split: train, validation or test.
+        sequences: how many are scored, at most the whole split, at least 2.
+        samples: S of the ELBO.
+        particles: K of PLL, IWAE and FIVO.
+        futures: K of the open-loop score.
+        context: number of steps that the open-loop score shows the model.
+        batch_size: sequences at a time.
+        seed: random seed of the noise; the same seed and batch size give the same numbers.
+
+    Returns:
+        Mean and standard error over the sequences by metric, in nats per sequence; `ess` as a share of K.
+
+    Raises:
+        ForbesError: for a score that does not exist, fewer than two sequences, or a score that is not finite.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> model = forbes.WorldModel.for_data(data).model
+        >>> scores = forbes.evaluate(model, data, scores=["elbo"], sequences=10, samples=2)
+        >>> sorted(scores)
+        ['elbo', 'kl', 'reconstruction']
+    """
+    if unknown := [name for name in scores if name not in PASSES]:
+        raise ForbesError(f"evaluate: there is no score {unknown[0]}, expected some of {', '.join(PASSES)}")
+    count = min(sequences, data.source.size(split))
+    if count < 2:
+        raise ForbesError(f"evaluate: a standard error needs at least 2 sequences, found {count}. Choose more")
+    numbers = {"samples": samples, "particles": particles, "futures": futures}
+    found: dict[str, Estimate] = {}
+    for name in scores:
+        score = make_pass(name, numbers[PASSES[name]], batch_size, context).of(model)
+        scored = score_split(model, split_batches(data, split, count, score.batch_size), score, seed)
+        found |= {metric: Estimate.of(scored.total(metric)) for metric in score.metrics}
+    return found
 
 
 _EXACT_ROWS = 20  # sequences; a belief on a fine grid is 3 MB each

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from forbes.beliefs import BeliefFamily
+from forbes.configured import Configurable
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, Perceptron
@@ -70,7 +71,7 @@ class Prediction(NamedTuple):
     """log W, normalised over the particles, `(K, B, T)`."""
 
 
-class BeliefModel(nn.Module, ABC):
+class BeliefModel(Configurable, nn.Module, ABC):
     """A recurrent model that holds a belief: it filters, predicts, imagines and decodes.
 
     To add one whose filter differs, copy `vector.py`: every abstract method below, and nothing else.

@@ -46,7 +46,14 @@ class Likelihood(ABC):
 
 
 class Bernoulli(Likelihood):
-    r"""Binary pixels with the output u as logit: :math:`\log p(x) = \sum x u - \mathrm{softplus}(u)`."""
+    r"""Binary pixels with the output u as logit: :math:`\log p(x) = \sum x u - \mathrm{softplus}(u)`.
+
+    Example:
+        >>> likelihood = forbes.Bernoulli()
+        >>> target = likelihood.target(torch.ones(5, 1, 28, 28, dtype=torch.uint8))
+        >>> likelihood.log_prob(torch.zeros(5, 1, 28, 28), target).shape
+        torch.Size([5])
+    """
 
     name, rank = "bernoulli", 3
 
@@ -84,6 +91,12 @@ class OnePixel(Likelihood):
 
     A softmax does not change when all logits move together, so a fixed one loses nothing. Shapes are those of images,
     `(C, H, W)`, of which i counts all C H W values.
+
+    Example:
+        >>> likelihood = forbes.OnePixel()
+        >>> target = likelihood.target(torch.zeros(5, 1, 28, 28, dtype=torch.uint8))
+        >>> likelihood.log_prob(torch.zeros(5, 1, 28, 28), target).shape
+        torch.Size([5])
     """
 
     name, rank = "categorical", 3
@@ -138,6 +151,12 @@ class Normal(Likelihood):
 
     Raises:
         ForbesError: when `bits` is not of 1 to 8, or below 8 for another scale than 255.
+
+    Example:
+        >>> likelihood = forbes.Normal(std=0.5)
+        >>> target = likelihood.target(torch.zeros(5, 3, 64, 64, dtype=torch.uint8))
+        >>> likelihood.log_prob(torch.zeros(5, 3, 64, 64), target).shape
+        torch.Size([5])
     """
 
     rank = 3
@@ -179,6 +198,12 @@ class VectorNormal(Likelihood):
 
     Args:
         std: :math:`\sigma`; the sensor's, where it is known.
+
+    Example:
+        >>> likelihood = forbes.VectorNormal(std=0.1)
+        >>> target = likelihood.target(torch.ones(5, 3))
+        >>> likelihood.log_prob(torch.zeros(5, 3), target).shape
+        torch.Size([5])
     """
 
     rank = 1
@@ -205,7 +230,14 @@ class VectorNormal(Likelihood):
 
 
 class OneHot(Likelihood):
-    r"""One of O symbols as a one-hot vector, with the output u as logits: :math:`\log p(x) = \log softmax(u)_x`."""
+    r"""One of O symbols as a one-hot vector, with the output u as logits: :math:`\log p(x) = \log softmax(u)_x`.
+
+    Example:
+        >>> likelihood = forbes.OneHot()
+        >>> target = likelihood.target(torch.eye(2)[torch.zeros(5, dtype=torch.long)])
+        >>> likelihood.log_prob(torch.zeros(5, 2), target).shape
+        torch.Size([5])
+    """
 
     name, rank = "categorical", 1
 

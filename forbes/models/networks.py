@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import elu, relu
 
+from forbes.configured import Configurable
 from forbes.deferred import Loop
 from forbes.errors import ForbesError
 from forbes.fusion import Elementwise, fused
@@ -80,7 +81,7 @@ def _gate(of_hidden: Tensor, of_x: Tensor, hidden: Tensor) -> Tensor:
     return torch.lerp(torch.addcmul(new_x, reset, new_h).tanh(), hidden, update)
 
 
-class Encoder(nn.Module):
+class Encoder(Configurable, nn.Module):
     """e_t = encoder(o_t): images `(N, C, H, W)`, or vectors `(N, O)`, to embeddings `(N, E)`.
 
     Attributes:
@@ -90,7 +91,7 @@ class Encoder(nn.Module):
     embedding_dim: int
 
 
-class Decoder(nn.Module):
+class Decoder(Configurable, nn.Module):
     """Features `(N, F)` to the likelihood's parameters, in the observation's shape."""
 
 
@@ -107,6 +108,11 @@ class MLPEncoder(Encoder):
         observation_shape: (C, H, W), or (O,).
         width: width of each layer, and E.
         layers: how many.
+
+    Example:
+        >>> encoder = forbes.MLPEncoder((3,), width=16)
+        >>> encoder(torch.zeros(7, 3)).shape
+        torch.Size([7, 16])
     """
 
     def __init__(self, observation_shape: tuple[int, ...], width: int = 200, layers: int = 2) -> None:
@@ -130,6 +136,11 @@ class MLPDecoder(Decoder):
         layers: how many hidden layers.
         output_bias: the output it starts from. The mean pixel, for strokes a logit of -4 or a value of -0.48, saves
             the first thousand updates of learning that most pixels are off, in which a posterior can collapse.
+
+    Example:
+        >>> decoder = forbes.MLPDecoder(feature_dim=30, observation_shape=(3,), width=16)
+        >>> decoder(torch.zeros(7, 30)).shape
+        torch.Size([7, 3])
     """
 
     def __init__(
@@ -184,6 +195,11 @@ class ConvEncoder(Encoder):
 
     Raises:
         ForbesError: for vectors, or smaller images.
+
+    Example:
+        >>> encoder = forbes.ConvEncoder((3, 64, 64))
+        >>> encoder(torch.zeros(7, 3, 64, 64)).shape
+        torch.Size([7, 1024])
     """
 
     def __init__(self, observation_shape: tuple[int, ...], channels: int = 32) -> None:
@@ -217,6 +233,11 @@ class ConvDecoder(Decoder):
 
     Raises:
         ForbesError: for vectors, or smaller images.
+
+    Example:
+        >>> decoder = forbes.ConvDecoder(feature_dim=30, observation_shape=(3, 64, 64))
+        >>> decoder(torch.zeros(7, 30)).shape
+        torch.Size([7, 3, 64, 64])
     """
 
     def __init__(

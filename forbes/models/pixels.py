@@ -27,6 +27,11 @@ class PixelEncoder(Encoder):
 
     Raises:
         ForbesError: for other shapes.
+
+    Example:
+        >>> encoder = forbes.PixelEncoder((1, 28, 28), width=16)
+        >>> encoder(torch.zeros(7, 1, 28, 28)).shape
+        torch.Size([7, 16])
     """
 
     def __init__(self, observation_shape: tuple[int, ...], width: int = 256) -> None:
@@ -65,6 +70,11 @@ class PixelDecoder(Decoder):
 
     Raises:
         ForbesError: for other shapes.
+
+    Example:
+        >>> decoder = forbes.PixelDecoder(feature_dim=30, observation_shape=(1, 28, 28), width=16)
+        >>> decoder(torch.zeros(7, 30)).shape
+        torch.Size([7, 1, 28, 28])
     """
 
     def __init__(self, feature_dim: int, observation_shape: tuple[int, ...], width: int = 256, blocks: int = 1) -> None:

@@ -45,6 +45,14 @@ class VectorModel(BeliefModel):
 
     Raises:
         ForbesError: where `state_dim` is not 0, or `overshoot` below 1.
+
+    Example:
+        >>> model = forbes.VectorModel(
+        ...     forbes.GaussianBelief, forbes.MLPEncoder((3,)), forbes.MLPDecoder(16, (3,)),
+        ...     forbes.VectorNormal(), action_dim=2, state_dim=0, hidden_dim=16, mlp_dim=16, mlp_layers=1)
+        >>> terms = model.elbo(torch.zeros(5, 10, 3), torch.zeros(5, 10, 2), torch.ones(5, 10, dtype=torch.bool))
+        >>> terms.elbo.shape
+        torch.Size([5])
     """
 
     parts: ClassVar[tuple[str, ...]] = ("overshoot",)

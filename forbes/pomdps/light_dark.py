@@ -33,6 +33,12 @@ class LightDark(Process):
         cells_per_step: of the grid of starts on [-25, 29], nine standard deviations to each side. With 250, log
             p(o_1:30) has an error of 4e-5 nats in the mean of sequences: none for most, and up to 6e-3 for a walk that
             is seen to pass the light.
+
+    Example:
+        >>> process = forbes.LightDark(cells_per_step=20)
+        >>> states, observations, actions = process.sample(4, 10, torch.Generator().manual_seed(0))
+        >>> process.exact_filter(observations, actions).log_likelihood.shape
+        torch.Size([4])
     """
 
     state_dim = 1

@@ -26,6 +26,12 @@ class LinearGaussian(Process):
         transition_variance: Q.
         observation_variance: R.
         initial_variance: :math:`P_1`.
+
+    Example:
+        >>> process = forbes.LinearGaussian(observation_variance=0.5)
+        >>> states, observations, actions = process.sample(4, 10, torch.Generator().manual_seed(0))
+        >>> process.exact_filter(observations, actions).log_likelihood.shape
+        torch.Size([4])
     """
 
     state_dim = 1

@@ -25,6 +25,12 @@ class MirrorSensor(Process):
         observation_std: :math:`\sigma`.
         cells: of the grid on [-6, 6]. 1601 have a thirteenth of the default :math:`\sigma` as width and an error of
             1e-7 nats in log p(o_1:30); 401 have 1e-5.
+
+    Example:
+        >>> process = forbes.MirrorSensor()
+        >>> states, observations, actions = process.sample(4, 10, torch.Generator().manual_seed(0))
+        >>> process.exact_filter(observations, actions).log_likelihood.shape
+        torch.Size([4])
     """
 
     state_dim = 1

@@ -49,6 +49,12 @@ class MountainHike(Process):
         start: "single" or "multi".
         observation_std: :math:`\sigma`; 0.1 as in DPFRL's command (the file has 0). Several starts are then told apart
             at once. With 1.5, no start has more than 95 % in half of the beliefs after 5 steps, in a fifth after 10.
+
+    Example:
+        >>> process = forbes.MountainHike()
+        >>> states, observations, actions = process.sample(4, 10, torch.Generator().manual_seed(0))
+        >>> process.exact_filter(observations, actions).log_likelihood.shape
+        torch.Size([4])
     """
 
     state_dim = 2

@@ -33,6 +33,12 @@ class TMaze(FiniteProcess):
     Args:
         length: L.
         stochasticity: :math:`\lambda` in [0, 1]; 0.2 is the other published setting.
+
+    Example:
+        >>> process = forbes.TMaze(length=5)
+        >>> states, observations, actions = process.sample(4, 10, torch.Generator().manual_seed(0))
+        >>> process.exact_filter(observations, actions).log_likelihood.shape
+        torch.Size([4])
     """
 
     def __init__(self, length: int = 10, stochasticity: float = 0.0) -> None:

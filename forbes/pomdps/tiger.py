@@ -27,6 +27,12 @@ class Tiger(FiniteProcess):
 
     Args:
         accuracy: p.
+
+    Example:
+        >>> process = forbes.Tiger()
+        >>> states, observations, actions = process.sample(4, 10, torch.Generator().manual_seed(0))
+        >>> process.exact_filter(observations, actions).log_likelihood.shape
+        torch.Size([4])
     """
 
     def __init__(self, accuracy: float = 0.85) -> None:

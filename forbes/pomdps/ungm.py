@@ -25,6 +25,12 @@ class Ungm(Process):
 
     Args:
         cells: of the grid on [-45, 45]. 901 have an error of 1e-9 nats in log p(o_1:30), 451 of 4e-4.
+
+    Example:
+        >>> process = forbes.Ungm()
+        >>> states, observations, actions = process.sample(4, 10, torch.Generator().manual_seed(0))
+        >>> process.exact_filter(observations, actions).log_likelihood.shape
+        torch.Size([4])
     """
 
     state_dim = 1

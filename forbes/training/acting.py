@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forbes.control.agent import Agent, Choice
 from forbes.control.policy import ScalarHead
-from forbes.data import SequenceBatch
+from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.data.collection import episode_seed, play_whole
 from forbes.data.episodes import Episode
 from forbes.envs import Environment
@@ -71,6 +71,11 @@ class ActingModel(WorldModel, ABC):
         self.reward_std, self.reward_layers = reward_std, reward_layers
         self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, reward_layers)
         activate(self.reward, self.activation)
+
+    @classmethod
+    def for_data(cls, data: SequenceDataModule, **options: Any) -> Self:
+        """See `WorldModel.for_data`; the data say whether actions are discrete, too."""
+        return super().for_data(data, **({"discrete": data.discrete} | options))
 
     @property
     def foresees_ends(self) -> bool:

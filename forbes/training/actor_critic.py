@@ -62,6 +62,13 @@ class ImaginationActorCritic(ActingModel):
 
     Raises:
         ForbesError: when N or a size is below 1, H below 2, or the data have no actions.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Experience("mountain_hike"), length=30, batch_size=20)
+        >>> agent = forbes.ImaginationActorCritic.for_data(data, trajectories=4, horizon=10)
+        >>> agent.model.action_dim, agent.discrete
+        (2, False)
+        >>> data.source.close()
     """
 
     def __init__(

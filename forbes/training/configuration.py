@@ -17,6 +17,7 @@ from lightning.pytorch.profilers import Profiler
 from lightning.pytorch.strategies import Strategy
 from torch import nn
 
+import forbes
 from forbes.data import SequenceDataModule, SequenceSource
 from forbes.errors import ForbesError
 from forbes.models import Likelihood
@@ -28,11 +29,12 @@ __all__ += ["experiment_parser", "require_classes"]
 _OF_FORBES = ("beliefs", "data", "models", "pomdps", "training")
 _OF_LIGHTNING = ("accelerators", "callbacks", "loggers", "plugins", "profilers", "strategies")
 TRUSTED = (
+    *(f"forbes.{name}" for name in forbes.MODULES),
     *(f"forbes.{part}" for part in _OF_FORBES),
     *(f"lightning.pytorch.{part}" for part in _OF_LIGHTNING),
     "lightning.fabric.plugins",
 )
-"""Packages whose classes a configuration may name."""
+"""Packages whose classes a configuration may name, and the public names of `import forbes`."""
 _REFUSED = ("*", "forbes.training.metrics_log")  # all else, and a logger that appends to whatever file it is given
 FAMILIES: tuple[type, ...] = (
     *(nn.Module, Likelihood, LightningDataModule, SequenceSource, Process, Callback, Logger, Profiler),

@@ -56,6 +56,13 @@ class KnownBelief(LightningModule):
     Raises:
         ForbesError: where the data are not of the process, the process lacks a density that the objective needs, or a
             size or the rate is not above 0.
+
+    Example:
+        >>> process = forbes.MirrorSensor()
+        >>> data = forbes.SequenceDataModule(forbes.Simulated(process, train=100), length=20)
+        >>> known = forbes.KnownBelief(process, forbes.MixtureBelief)
+        >>> known.state_nll(data.sequences("train", torch.arange(5))).shape
+        torch.Size([5, 20])
     """
 
     def __init__(

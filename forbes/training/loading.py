@@ -23,12 +23,13 @@ from forbes.training.configuration import (
     experiment_parser,
     require_classes,
 )
+from forbes.training.hyperparameters import build_arguments, plain_arguments
 from forbes.training.known_model import KnownBelief
 from forbes.training.run_folder import RunFolder, read_config
 from forbes.training.world_model import WorldModel
 
 __all__ = ["LoadedRun", "build_run", "check_weights", "load_known_belief", "load_run", "loaded_agent", "open_run"]
-__all__ += ["weights_of"]
+__all__ += ["load_module", "weights_of"]
 
 Module = TypeVar("Module", bound=LightningModule)
 
@@ -54,6 +55,11 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
     Raises:
         ForbesError: when the folder holds no trained run or one of another kind, or its configuration and its
             checkpoint do not fit together.
+
+    Example:
+        >>> world, data = forbes.load_run("runs/forbes-0")  # forbes fit --run_dir runs/forbes-0 --config ...
+        >>> world.terms(data.sequences("test", torch.arange(8))).elbo.shape
+        torch.Size([8])
     """
     loaded = open_run(run)
     return loaded.module, loaded.data
@@ -69,11 +75,37 @@ def load_known_belief(run: Path | str) -> LoadedRun[KnownBelief]:
     return _load(run, KnownBelief, "forbes evaluate")
 
 
-def _load(run: Path | str, kind: type[Module], other: str) -> LoadedRun[Module]:
+def load_module(checkpoint: Path, kind: type[Module], arguments: Mapping[str, Any]) -> Module:
+    """Load a module from a checkpoint, on the CPU; see `WorldModel.load_from_checkpoint`.
+
+    Args:
+        checkpoint: in a run folder, `RUN/checkpoints/NAME.ckpt`, or elsewhere, of a plain `Trainer`.
+        kind: class of the module.
+        arguments: of its constructor, in the place of those it was trained with.
+    """
+    if RunFolder(checkpoint).config.is_file():
+        changes = {f"model.init_args.{name}": value for name, value in arguments.items()}
+        return _load(checkpoint, kind, "forbes beliefs", changes).module
+    content = open_checkpoint(checkpoint).content
+    state = weights_of(content, str(checkpoint))
+    saved = content.get("hyper_parameters", {})
+    if not isinstance(saved, dict):
+        raise ForbesError(
+            f"{checkpoint}: its hyper_parameters are a {type(saved).__name__}, expected arguments by name. Take another"
+        )
+    saved = {name: value for name, value in saved.items() if name not in arguments}
+    module = kind(**build_arguments(kind, saved, str(checkpoint)), **arguments)
+    check_weights(module, state, str(checkpoint))
+    module.load_state_dict(state)
+    module.save_hyperparameters(saved | plain_arguments(arguments))
+    return module
+
+
+def _load(run: Path | str, kind: type[Module], other: str, changes: Mapping[str, Any] = {}) -> LoadedRun[Module]:
     folder = RunFolder.trained(run)
     checkpoint = open_checkpoint(folder.checkpoint)
     state = weights_of(checkpoint.content, str(folder.checkpoint))
-    module, data, config = build_run(folder)
+    module, data, config = build_run(folder, changes)
     if not isinstance(module, kind):
         found = type(module).__name__
         raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Measure it with: {other} {run}")
@@ -82,14 +114,20 @@ def _load(run: Path | str, kind: type[Module], other: str) -> LoadedRun[Module]:
     return LoadedRun(module.eval(), data, config, checkpoint.sha256)
 
 
-def build_run(folder: RunFolder) -> tuple[LightningModule, SequenceDataModule, dict[str, Any]]:
+def build_run(
+    folder: RunFolder, changes: Mapping[str, Any] = {}
+) -> tuple[LightningModule, SequenceDataModule, dict[str, Any]]:
     """Build the module and the data of a run's config.yaml, and return them with it; the weights are untrained.
+
+    Args:
+        folder: of the run.
+        changes: values that replace those of config.yaml, by their keys, such as `model.init_args.learning_rate`.
 
     Raises:
         ForbesError: where the configuration cannot be built, or its data are not there.
     """
     config = read_config(folder.config)
-    for key, value in changed_defaults(config).items():
+    for key, value in {**changed_defaults(config), **changes}.items():
         _put(config, key, value)
     allow_modules()
     parser = experiment_parser()

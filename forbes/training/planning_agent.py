@@ -23,6 +23,13 @@ class PlanningAgent(ActingModel):
 
     Raises:
         ForbesError: when a number is below 1, `best` above `candidates`, or actions are discrete.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Experience("mountain_hike"), length=30, batch_size=20)
+        >>> agent = forbes.PlanningAgent.for_data(data, candidates=100, best=10)
+        >>> agent.model.action_dim, agent.discrete
+        (2, False)
+        >>> data.source.close()
     """
 
     def __init__(

@@ -8,6 +8,7 @@ from typing import Any
 
 import pandas as pd
 
+import forbes
 from forbes.errors import ForbesError
 from forbes.files import locked, remove_halves, require_no_links
 from forbes.reading import is_number, read_yaml
@@ -112,7 +113,7 @@ def experiment_name(configs: Sequence[str]) -> str:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read the config.yaml of a run.
+    """Read the config.yaml of a run, with the public name of each class, which an older run has in full.
 
     Raises:
         ForbesError: where it is not what `forbes fit` writes.
@@ -127,7 +128,18 @@ def read_config(path: Path) -> dict[str, Any]:
             raise ForbesError(f"{path}: its section {name} has no class_path, expected the name of a class. {remedy}")
         if not isinstance(section.setdefault("init_args", {}), dict):
             raise ForbesError(f"{path}: {name}.init_args is no mapping, expected arguments by name. {remedy}")
-    return config
+    named: dict[str, Any] = _with_public_names(config)
+    return named
+
+
+def _with_public_names(section: Any) -> Any:
+    """Return a part of a configuration with `forbes.WorldModel` in the place of `forbes.training.WorldModel`."""
+    if isinstance(section, list):
+        return [_with_public_names(value) for value in section]
+    if isinstance(section, dict):
+        return {key: _with_public_names(value) for key, value in section.items()}
+    module, _, name = section.rpartition(".") if isinstance(section, str) else ("", "", "")
+    return f"forbes.{name}" if module and forbes.MODULES.get(name) == module else section
 
 
 def read_metrics(run: Path | str) -> pd.DataFrame:

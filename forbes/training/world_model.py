@@ -1,8 +1,10 @@
 """The world model as a LightningModule: it optimises and logs; the mathematics is in `forbes.models`."""
 
+import inspect
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, TypeAlias, cast
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NamedTuple, Self, TypeAlias, cast
 
 import torch
 from lightning import LightningModule
@@ -11,15 +13,19 @@ from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from forbes.beliefs import BeliefFamily, FlowBelief
-from forbes.data import SequenceBatch
+from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.errors import ForbesError
-from forbes.models.base import BeliefModel, ModelFamily
+from forbes.models.base import ModelFamily
 from forbes.models.elbo import KL, ElboTerms, FreeNats, elbo_loss
-from forbes.models.likelihoods import Likelihood, Normal, VectorNormal
+from forbes.models.likelihoods import Likelihood, Normal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
 from forbes.models.state_space import StateSpaceModel
 from forbes.seeding import derive_seed
+from forbes.signatures import full_signature
+from forbes.training.defaults import defaults_for
 from forbes.training.divergence import hold_unless_finite
+from forbes.training.hyperparameters import plain_arguments
+from forbes.training.requirements import require_mean, require_path, require_rank
 
 __all__ = ["Group", "Objective", "WorldModel", "batches_before", "follow_rates", "require_at_least", "together"]
 
@@ -71,6 +77,13 @@ class WorldModel(LightningModule):
     Raises:
         ForbesError: when a size is below 1, the learning rate or `clip_norm` below 0, or `likelihood` or `center` does
             not fit.
+
+    Example:
+        >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+        >>> world = forbes.WorldModel.for_data(data, belief=forbes.FlowBelief.configured(layers=3))
+        >>> batch = data.sequences("test", torch.arange(8))
+        >>> world.terms(batch).elbo.shape  # train it with Trainer().fit(world, data)
+        torch.Size([8])
     """
 
     def __init__(
@@ -103,7 +116,7 @@ class WorldModel(LightningModule):
         require_at_least(1, "WorldModel", hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers)
         require_at_least(0, "WorldModel", state_dim=state_dim, learning_rate=learning_rate, clip_norm=clip_norm)
         likelihood = likelihood or Normal()
-        _require_rank(likelihood, observation_shape)
+        require_rank(likelihood, observation_shape)
         self.model = model(
             belief,
             encoder(observation_shape),
@@ -116,15 +129,60 @@ class WorldModel(LightningModule):
             mlp_layers,
             prior,
         )
-        _require_path(kl, self.model)
+        require_path(kl, self.model)
         self.activation: Activation = activation
         activate(self.model, activation)
         if center:
-            _require_mean(likelihood)
+            require_mean(likelihood)
             self.model.center = torch.zeros(observation_shape)
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.learning_rate, self.schedule, self.warmup = learning_rate, schedule, warmup
         self.clip_norm, self.seed = clip_norm, seed
+
+    __signature__: ClassVar[inspect.Signature]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Show the arguments of `WorldModel` in the signature of every class that derives from it, too."""
+        super().__init_subclass__(**kwargs)
+        cls.__signature__ = full_signature(cls)
+
+    @classmethod
+    def for_data(cls, data: SequenceDataModule, **options: Any) -> Self:
+        """Build a model for these data: their shapes and seed, and networks and a likelihood that fit them.
+
+        Args:
+            data: with the source that the model is to learn.
+            **options: arguments of the constructor by name. What is not given is as in `configs/` for such data (see
+                `defaults_for`).
+        """
+        of_data = {"observation_shape": data.observation_shape, "action_dim": data.action_dim, "seed": data.seed}
+        arguments: dict[str, Any] = of_data | defaults_for(data.source) | options
+        model = cls(**arguments)
+        model.save_hyperparameters(plain_arguments(arguments))  # for `load_from_checkpoint`
+        return model
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]  # without what would unpickle
+        cls, checkpoint_path: Path | str, map_location: torch.device | str = "cpu", **arguments: Any
+    ) -> Self:
+        """Load a trained model. Only tensors and plain values are read, and nothing is unpickled.
+
+        Args:
+            checkpoint_path: a checkpoint of a run folder, whose config.yaml has the arguments of the model, or one that
+                a plain `Trainer` saved, which has those itself if the model was built by `for_data`.
+            map_location: device of the loaded model.
+            **arguments: arguments of the constructor that replace those the model was trained with. For a run folder
+                they are plain values, as in config.yaml.
+
+        Returns:
+            The model in training mode; call `eval()` to measure it.
+
+        Raises:
+            ForbesError: where the checkpoint is damaged, of another class, or does not fit the arguments.
+        """
+        from forbes.training.loading import load_module  # it imports the models
+
+        return load_module(Path(checkpoint_path), cls, arguments).train().to(map_location)
 
     @property
     def objective_name(self) -> str:
@@ -252,39 +310,6 @@ def follow_rates(module: LightningModule, rates: Sequence[float]) -> None:
     scheduler.base_lrs = [*rates]
     for group, rate, share in zip(scheduler.optimizer.param_groups, rates, scheduler.lr_lambdas, strict=True):
         group["lr"] = rate * share(scheduler.last_epoch)
-
-
-def _require_path(kl: KL, model: BeliefModel) -> None:
-    """Raise a ForbesError for a path derivative where there is none."""
-    if kl != "path":
-        return
-    if type(model) is not StateSpaceModel:
-        raise ForbesError(f"WorldModel: kl is path for a {type(model).__name__}, expected analytic. Leave kl out")
-    if not model.posterior.reparameterised:
-        name = type(model.posterior).__name__
-        raise ForbesError(
-            f"WorldModel: kl is path, but the draws of a {name} are not reparameterised, expected analytic or "
-            "monte_carlo. Leave kl out"
-        )
-
-
-def _require_rank(likelihood: Likelihood, observation_shape: tuple[int, ...]) -> None:
-    """Raise a ForbesError where a likelihood would sum over what is no dimension of an observation."""
-    if likelihood.rank != len(observation_shape):
-        others = {1: "VectorNormal or OneHot", 3: "Normal or Bernoulli"}.get(len(observation_shape), "your own")
-        raise ForbesError(
-            f"WorldModel: the likelihood {type(likelihood).__name__} is of observations of rank {likelihood.rank}, "
-            f"found shape {(*observation_shape,)}. Choose {others} as model.likelihood"
-        )
-
-
-def _require_mean(likelihood: Likelihood) -> None:
-    """Raise a ForbesError where a decoder's output is not the mean of the target, so cannot be one off a center."""
-    if not isinstance(likelihood, Normal | VectorNormal):
-        raise ForbesError(
-            f"WorldModel: center with the likelihood {type(likelihood).__name__}, expected Normal or VectorNormal. "
-            "Leave center out"
-        )
 
 
 def require_at_least(least: float, where: str, **numbers: Any) -> None:

@@ -12,12 +12,14 @@ import torch
 from small_models import make_model
 
 from forbes.cli import main
+from forbes.errors import ForbesError
 from forbes.evaluation import scoring, tables
 from forbes.evaluation.commands import evaluate as measure
 from forbes.evaluation.measured import Measured, pair
 from forbes.evaluation.references import references
 from forbes.evaluation.runs import load_runs, split_batches
 from forbes.evaluation.scoring import Parts, make_pass, score_split
+from forbes.evaluation.scoring import evaluate as evaluate_model
 from forbes.training.loading import load_run
 from forbes.training.run_folder import RunFolder
 
@@ -52,6 +54,46 @@ def other_filters(tiny_config, tmp_path_factory):
     folder = tmp_path_factory.mktemp("filters")
     kinds = {"vector": VECTOR, "particle": PARTICLE}
     return [str(fit(tiny_config, folder / name, *flags)) for name, flags in kinds.items()]
+
+
+def test_python_gives_the_numbers_that_the_command_records(runs):
+    options = {"sequences": 6, "samples": 2, "particles": 3, "futures": 4, "context": 2, "batch_size": 4, "seed": 5}
+    flags = [part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))]
+    assert main(["evaluate", runs[0], *flags]) == 0
+    recorded = json.loads((Path(runs[0]) / "evaluation.json").read_text())
+
+    world, data = load_run(runs[0])
+    found = evaluate_model(world.model, data, ("elbo", "pll", "fivo", "open-loop"), **options)
+
+    means = {name.partition("/")[2].partition("[")[0]: entry for name, entry in recorded.items() if "mean" in entry}
+    assert set(found) == {
+        "elbo",
+        "reconstruction",
+        "kl",
+        "iwae",
+        "pll",
+        "fivo",
+        "ess",
+        "open_loop",
+        "open_loop_marginal",
+    }
+    for metric, estimate in found.items():
+        assert estimate.mean == means[metric]["mean"]
+        assert estimate.standard_error == means[metric]["standard_error"]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"scores": ["elbow"]}, "there is no score elbow, expected some of elbo, pll, fivo, open-loop"),
+        ({"sequences": 1}, "a standard error needs at least 2 sequences, found 1"),
+    ],
+)
+def test_a_score_that_cannot_be_had_in_python_is_one_sentence(runs, options, sentence):
+    world, data = load_run(runs[0])
+
+    with pytest.raises(ForbesError, match=sentence):
+        evaluate_model(world.model, data, **options)
 
 
 def evaluate(*arguments):

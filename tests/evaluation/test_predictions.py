@@ -5,7 +5,8 @@ import torch
 
 from forbes.beliefs import FlowBelief
 from forbes.data import SequenceDataModule, Strokes
-from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
+from forbes.errors import ForbesError
+from forbes.evaluation.predictions import complete, filter, first_of_each_class, imagine, whole_sequences
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, OnePixel, Rollout, StateSpaceModel
 
 
@@ -54,6 +55,39 @@ def test_a_completion_knows_the_prefix_and_nothing_else(model, data, batch):
 
     assert torch.equal(seeded(model, data, batch._replace(observation=future)).frames, frames)
     assert not torch.equal(seeded(model, data, batch._replace(observation=past)).frames, frames)
+
+
+def test_to_complete_is_to_filter_imagine_and_decode(model, data, batch):
+    beginning, future = (batch._replace(**fields(batch, steps)) for steps in (slice(4), slice(4, None)))
+
+    torch.manual_seed(0)
+    rollout = imagine(model, filter(model, beginning, samples=3), future.action)
+    frames = model.likelihood.mean(model.decode(rollout.features))  # (N B, T - c, C, H, W)
+
+    assert torch.equal(frames.unflatten(0, (3, 5)), seeded(model, data, batch).frames)
+
+
+def fields(batch, steps):
+    return {name: getattr(batch, name)[:, steps] for name in ("observation", "action", "mask")}
+
+
+def test_samples_of_a_belief_are_rolled_on_by_the_actions_of_their_sequence(model, batch):
+    belief = filter(model, batch, samples=2)
+    assert belief.hidden.shape == (10, 4)
+    assert belief.state.shape == (10, 2)
+
+    rollout = imagine(model, belief, batch.action)
+
+    hidden = model.gru(model.transition(torch.cat((belief.state[7], batch.action[2, 0]))), belief.hidden[7])
+    torch.testing.assert_close(rollout.hidden[7, 0], hidden)  # the second sample of the third sequence
+    assert not rollout.state.requires_grad
+
+
+def test_a_belief_of_other_sequences_than_the_actions_is_one_sentence(model, batch):
+    belief = filter(model, batch, samples=2)
+
+    with pytest.raises(ForbesError, match="the belief has 10 rows, expected a multiple of the 4 sequences of action"):
+        imagine(model, belief, batch.action[:4])
 
 
 def test_samples_of_one_prefix_differ(model, data, batch):

@@ -6,7 +6,7 @@ import pytest
 
 from forbes.errors import ForbesError
 from forbes.training.metrics_log import JsonLinesLogger
-from forbes.training.run_folder import RunFolder, experiment_name, read_metrics
+from forbes.training.run_folder import RunFolder, experiment_name, read_config, read_metrics
 
 
 @pytest.mark.parametrize(
@@ -130,3 +130,20 @@ def test_a_line_that_is_no_line_of_metrics_is_named(tmp_path, line):
 def test_missing_metrics_are_one_sentence(tmp_path):
     with pytest.raises(ForbesError, match=r"metrics\.jsonl: no such file"):
         read_metrics(tmp_path)
+
+
+def test_an_older_run_says_the_public_names_of_its_classes(tmp_path):
+    """A run of a version that wrote the packages of its classes has the same configuration as a run of today."""
+    older = (
+        "model: {class_path: forbes.training.WorldModel, init_args: {belief: {class_path: forbes.beliefs.FlowBelief}}}"
+    )
+    path = tmp_path / "config.yaml"
+    path.write_text(f"{older}\ndata: {{class_path: forbes.data.SequenceDataModule}}\n")
+
+    config = read_config(path)
+
+    assert config["model"] == {
+        "class_path": "forbes.WorldModel",
+        "init_args": {"belief": {"class_path": "forbes.FlowBelief"}},
+    }
+    assert config["data"]["class_path"] == "forbes.SequenceDataModule"

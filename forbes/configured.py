@@ -1,0 +1,28 @@
+"""Classes whose instances are built later, by whoever knows the sizes: `FlowBelief.configured(layers=3)`."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Self
+
+__all__ = ["Configurable"]
+
+
+class Configurable:
+    """A class that a model builds itself, from sizes that only the model knows.
+
+    Example:
+        >>> from forbes import FlowBelief
+        >>> family = FlowBelief.configured(layers=3)
+        >>> head = family(2, 16)  # state_dim, context_dim
+        >>> type(head).__name__, head.state_dim
+        ('FlowBelief', 2)
+    """
+
+    @classmethod
+    def configured(cls, **options: Any) -> Callable[..., Self]:
+        """Return a function that builds an instance with these options.
+
+        Args:
+            **options: arguments of the constructor by name, all but the sizes.
+        """
+        return partial(cls, **options)
