@@ -98,4 +98,5 @@ def test_the_example_of_the_readme_runs(in_tmp_path, monkeypatch):
 
     exec(example, names)
 
-    assert names["pixels"].shape == (80, 15, 1, 28, 28)
+    assert names["frames"].shape == (10, 8, 15, 1, 28, 28)
+    assert names["future"].features.shape[:2] == (80, 15)
