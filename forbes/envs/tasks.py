@@ -77,6 +77,11 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
         make = partial(Gymnasium, task.removeprefix(_GYMNASIUM))
     elif near := difflib.get_close_matches(task, [*own, *_NAMED], n=1, cutoff=0.8):
         raise ForbesError(f"{task}: no such task. Did you mean {near[0]}?")
+    elif "_" not in task:  # which every DOMAIN_TASK of DeepMind Control has
+        raise ForbesError(
+            f"{task}: no such task. `forbes data collect --help` says what there is; an environment of your own needs "
+            "--allow-module MODULE"
+        )
     else:
         make = partial(DeepMindControl, task)
     unknown = options.keys() - inspect.signature(make).parameters.keys()

@@ -129,6 +129,12 @@ def test_names_that_are_nearly_right_are_suggested():
         find_environment("tiger", camera=1)
 
 
+def test_an_environment_of_a_module_that_is_not_allowed_is_no_task():
+    """It was taken for one of DeepMind Control, which lacked its options."""
+    with pytest.raises(ForbesError, match=r"^Parakeet: no such task\..* needs --allow-module MODULE$"):
+        find_environment("Parakeet", steps=8)
+
+
 @pytest.mark.parametrize("task", ["mountain_hike", "multi_start_hike", "t_maze", "tiger"])
 def test_with_the_exact_belief_an_episode_is_the_same_and_its_belief_is_shown(task):
     """Beside the ordinary episode of the same seed and actions, whose observations are filtered at the end."""
