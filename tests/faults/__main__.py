@@ -126,11 +126,6 @@ def _groups(folder: Path, options: argparse.Namespace) -> Iterator[Group]:
         ],
     )
     yield Group(
-        "batches that do not fit are halved, and the scores stay",
-        "a limit of memory below what a batch of the evaluation needs",
-        [functools.partial(resources.little_memory, trained, folder / "memory")],
-    )
-    yield Group(
         "nothing grows with time",
         f"{options.starts} starts of an environment's process; {options.epochs} epochs of an agent with overlap and "
         "capacity: memory, descriptors, threads, disk",
@@ -207,8 +202,8 @@ was left over, was not one sentence, or had a traceback. {notes}
   package needs no failpoints of its own.
 - **Left over:** no process of its session lives two seconds after a command has ended; no temporary file is in the
   folder after it has been begun again.
-- **Not tested:** a power loss (files are synced before they are renamed, but no disk was cut off), network file
-  systems, Windows.
+- **Not tested here:** a power loss (files are synced before they are renamed, but no disk was cut off), network file
+  systems, Windows; too little memory (`tests/evaluation/test_scoring.py` injects the errors).
 
 forbes {version}, {system}, {day}, {minutes} minutes.
 """

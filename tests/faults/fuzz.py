@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import io
+import multiprocessing
 import os
 import random
 import signal
@@ -78,6 +79,8 @@ def configurations(config: Path, folder: Path, inputs: int, seed: int) -> Outcom
         if outside:
             outcome.broken.append(f"{changed}: wrote or ran {outside}")
             outside.clear()
+        for process in multiprocessing.active_children():  # of an environment; the end of a command would end them
+            process.kill()
     return outcome
 
 

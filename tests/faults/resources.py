@@ -1,10 +1,9 @@
-"""What a machine runs out of, or does at the same time: disk, permissions, memory, the clock, two of everything."""
+"""What a machine lacks, or does at the same time: disk, permissions, the clock, two of everything, many of one."""
 
 import itertools
 import os
 import re
 import resource
-import shutil
 import subprocess
 import sys
 import time
@@ -19,7 +18,7 @@ from toy_environments import Parrot
 
 from forbes.envs import EnvironmentProcess
 
-__all__ = ["backwards", "limited", "little_memory", "long_agent", "read_only", "two_at_once", "workers"]
+__all__ = ["backwards", "limited", "long_agent", "read_only", "two_at_once", "workers"]
 
 NOBODY = 65534
 
@@ -55,18 +54,6 @@ def backwards(scenario: Scenario, expected: dict[str, object], folder: Path) -> 
     return Outcome(f"{scenario.name}, a clock that goes back", broken)
 
 
-def little_memory(trained: Path, folder: Path) -> Outcome:
-    """Evaluate in a batch that does not fit: it is halved, and the scores are those of small ones."""
-    scores = ["--scores", "pll", "--particles", "2000", "--batch-size"]
-    small, large = (shutil.copytree(trained, folder / name) for name in ("small", "large"))
-    with_room = run(["evaluate", small, *scores, "2"], small)
-    size = _virtual_memory() + 150 * 2**20
-    ending = run(["evaluate", large, *scores, "12"], large, before=lambda: _limit_memory(size))
-    outcome = Outcome("evaluation with little memory", reached="no memory for" in ending.output)
-    outcome.broken += [*_no_sentence(with_room, small, {0}), *_no_sentence(ending, large, {0})]
-    return outcome
-
-
 def two_at_once(scenario: Scenario, expected: dict[str, object], folder: Path) -> Outcome:
     """Run a command twice in one folder at the same time."""
     scenario.prepare(folder)
@@ -84,7 +71,9 @@ def two_at_once(scenario: Scenario, expected: dict[str, object], folder: Path) -
 
 def workers(starts: int) -> Outcome:
     """Start and end the process of an environment again and again."""
-    outcome, before = Outcome("the process of an environment", cases=starts), _descriptors()
+    outcome = Outcome("the process of an environment", cases=starts)
+    EnvironmentProcess(Parrot).close()  # the first also starts what tracks the resources of all
+    before = _descriptors()
     for _ in range(starts):
         with EnvironmentProcess(Parrot) as environment:
             environment.reset(0)
@@ -127,10 +116,10 @@ class _Use(NamedTuple):
 
 
 def _use(process: int, run: Path) -> _Use:
-    """Look at a process and its run, but for the log, which does grow."""
+    """Look at a process, its episodes and its checkpoints; its log does grow, its index up to where it is compacted."""
     status = Path(f"/proc/{process}/status").read_text()
     memory, threads = (int(re.findall(rf"^{name}:\s+(\d+)", status, re.MULTILINE)[0]) for name in ("VmRSS", "Threads"))
-    sizes = [path.stat().st_size for path in run.rglob("*.*") if path.suffix in (".npz", ".ckpt", ".jsonl")]
+    sizes = [path.stat().st_size for path in run.rglob("*.*") if path.suffix in (".npz", ".ckpt")]
     return _Use(1024 * memory, len(os.listdir(f"/proc/{process}/fd")), threads, sum(sizes))
 
 
@@ -146,14 +135,6 @@ def _no_sentence(ending: Ending, folder: Path, statuses: set[int]) -> Iterator[s
         yield f"ended with status {ending.status}: …{ending.output[-600:]}"
     elif ending.status == 2 and (str(folder) not in line or len(line.replace(str(folder), "")) > 300):
         yield f"does not name the file: {line}"
-
-
-def _limit_memory(size: int) -> None:
-    resource.setrlimit(resource.RLIMIT_AS, (size, size))
-
-
-def _virtual_memory() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
 
 def _descriptors() -> int:
