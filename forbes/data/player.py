@@ -44,9 +44,7 @@ class Player:
             seed: of environment and policy.
         """
         self._number = number
-        self._message = pickle.dumps(
-            (make_policy, number, seed)
-        )  # a pipe's own way to send tensors shares their memory
+        self._message = pickle.dumps((make_policy, number, seed))  # a pipe's own way shares the memory of tensors
         self._ask()
 
     def finish(self, attempts: int = ATTEMPTS) -> Episode:

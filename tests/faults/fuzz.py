@@ -18,7 +18,7 @@ from typing import Any
 import yaml
 from damage import Kind, damaged, read_or_sentence
 from faults.outcome import Outcome
-from faults.victims import OPERATIONS
+from faults.victims import changed_file
 
 from forbes.cli import main
 
@@ -70,7 +70,7 @@ def configurations(config: Path, folder: Path, inputs: int, seed: int) -> Outcom
         try:
             with _alarm(), contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
                 status = main([*command, "--run_dir", str(folder / str(number))])
-        except BaseException:
+        except (Exception, SystemExit):
             outcome.broken.append(f"{changed}: {traceback.format_exc(limit=-3)}")
             continue
         sentence = (output.getvalue().strip().splitlines() or [""])[-1].replace(str(folder), "")
@@ -88,10 +88,10 @@ def _watch_writes(outside: list[str], inside: tuple[str, ...]) -> None:
     """List what this process writes elsewhere, and commands that it runs."""
 
     def hook(event: str, found: tuple[Any, ...]) -> None:
-        writes = event == "open" and isinstance(found[2], int) and found[2] & (os.O_WRONLY | os.O_RDWR)
-        if (writes or event in OPERATIONS) and isinstance(found[0], str):
-            if not os.path.realpath(found[0]).startswith(inside):
-                outside.append(f"{event} {found[0]}")
+        path = changed_file(event, found)
+        if path is not None:
+            if not os.path.realpath(path).startswith(inside):
+                outside.append(f"{event} {path}")
         elif event in ("os.system", "subprocess.Popen") and COMMAND in str(found):
             outside.append(f"{event} {found}")
 

@@ -76,8 +76,7 @@ class Scenario:
 
     def life(self, folder: Path, fault: Fault | None) -> Ending:
         """Run the command once."""
-        arguments = self.command(folder)
-        return self.start(arguments, fault) if self.start is run_real else self.start(arguments, folder, fault)
+        return self.start(self.command(folder), folder, fault)
 
 
 def strike(scenario: Scenario, expected: dict[str, object], folder: Path, fault: Fault) -> Outcome:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 from forbes.cli import main
 
-__all__ = ["LIMIT", "Ending", "Fault", "left_over", "run", "run_real"]
+__all__ = ["LIMIT", "Ending", "Fault", "changed_file", "left_over", "run", "run_real"]
 
 OPERATIONS = {"os.rename", "os.link", "os.remove", "os.mkdir", "os.truncate"}
 LIMIT = 300  # seconds, after which a command hangs
@@ -88,8 +88,8 @@ class _Pipe:
             return (reader.read() or b"").decode(errors="replace")
 
 
-def run_real(arguments: list[object], fault: Fault | None = None) -> Ending:
-    """Run a command as a user does, start-up and all."""
+def run_real(arguments: list[object], folder: Path, fault: Fault | None = None) -> Ending:
+    """Run a command as a user does, start-up and all. Its files are not watched, so faults go by the clock."""
     output = _Pipe()
     command = [sys.executable, "-m", "forbes", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=output.written, stderr=subprocess.STDOUT, start_new_session=True)
@@ -136,20 +136,25 @@ def _command(
         os._exit(status)
 
 
+def changed_file(event: str, arguments: tuple[object, ...]) -> str | None:
+    """Return the file or folder that an audited operation changes, or opens to write; None for any other event."""
+    opened = event == "open" and isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+    named = (opened or event in OPERATIONS) and isinstance(
+        arguments[0], str | os.PathLike
+    )  # a descriptor is open already
+    return str(arguments[0]) if named else None
+
+
 def _watch(folder: Path, fault: Fault | None, operations: int) -> None:
     prefix, count = f"{folder}{os.sep}", 0
 
     def hook(event: str, arguments: tuple[object, ...]) -> None:
         nonlocal count
-        if event == "open":
-            if not isinstance(arguments[2], int) or not arguments[2] & (os.O_WRONLY | os.O_RDWR):
-                return
-        elif event not in OPERATIONS:
-            return
-        if not str(arguments[0]).startswith(prefix):
+        path = changed_file(event, arguments)
+        if path is None or not path.startswith(prefix):
             return
         count += 1
-        name = re.sub(r"\.[0-9a-f]{16}\b", ".*", str(arguments[0]).removeprefix(prefix))
+        name = re.sub(r"\.[0-9a-f]{16}\b", ".*", path.removeprefix(prefix))
         os.write(operations, f"{event} {name}\n".encode())
         if fault is not None and count == fault.at:
             (os.killpg if fault.group else os.kill)(os.getpid(), fault.signal)
