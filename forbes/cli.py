@@ -32,7 +32,7 @@ COMMANDS = {
     "replay": Command("show where a training has diverged", "RUN/failure.pt", "forbes.training.replay_command:main"),
     "evaluate": Command("measure trained models and compare them", "RUN RUN", "forbes.evaluation.commands:main"),
     "rollout": Command("film an agent", "RUN --video agent.gif", "forbes.figures.rollout_command:main"),
-    "beliefs": Command("hold learned beliefs against exact ones", "RUN RUN", "forbes.evaluation.belief_command:main"),
+    "beliefs": Command("compare learned beliefs with exact ones", "RUN RUN", "forbes.evaluation.belief_command:main"),
     "theorem": Command("check Theorem 1 in closed form", "--steps 30", "forbes.evaluation.theorem_command:main"),
     "compare": Command(
         "train and measure configurations alike",
@@ -43,7 +43,7 @@ COMMANDS = {
         "check a filter against its own model", "RUN -o figures", "forbes.figures.calibrate_command:main"
     ),
     "completions": Command(
-        "tell how precise and diverse predicted digits are",
+        "measure how precise and diverse predicted digits are",
         "RUN RUN -o figures",
         "forbes.figures.completions_command:main",
     ),

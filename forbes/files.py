@@ -196,7 +196,7 @@ def locked(folder: Path, complaint: str) -> Iterator[None]:
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Give the content of a compressed `.npz` file whose bytes depend on the arrays alone.
+    """Return the content of a compressed `.npz` file whose bytes depend on the arrays alone.
 
     `numpy.savez_compressed` would stamp the members with the time of writing.
     """

@@ -47,12 +47,12 @@ def fused(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def keep(x: Tensor) -> Tensor:
-    """Give x: nothing follows."""
+    """Return x: nothing follows."""
     return x
 
 
 def after_affine(then: Elementwise, share: Tensor, x: Tensor, matrix: Tensor, *more: Any) -> Any:
-    """Give then(x W + b, ...), with b as `(B, out)`.
+    """Return then(x W + b, ...), with b as `(B, out)`.
 
     Under `fusing`, adding b is part of what follows: `addmm` would copy it first, a kernel as long as the product.
     """

@@ -14,5 +14,5 @@ def derive_seed(seed: int, purpose: str, counter: int) -> int:
 
 
 def generator(seed: int, purpose: str, counter: int) -> torch.Generator:
-    """Give a CPU generator that depends on (seed, purpose, counter) only."""
+    """Return a CPU generator that depends on (seed, purpose, counter) only."""
     return torch.Generator().manual_seed(derive_seed(seed, purpose, counter))

@@ -48,7 +48,7 @@ class BeliefHead(Configurable, nn.Module, ABC):
 
     @abstractmethod
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
-        """Give log p(s | c) in nats, summed over the state: shapes `(*, D)` and `(*, C)` to `(*)`, which broadcast."""
+        """Return log p(s | c) in nats, summed over the state: `(*, D)` and `(*, C)`, which broadcast, to `(*)`."""
 
     def path_log_prob(self, state: Tensor, context: Tensor) -> Tensor:
         r"""Return log p(s | c) as a function of s alone: neither the parameters nor the context have a gradient.
@@ -68,7 +68,7 @@ class BeliefHead(Configurable, nn.Module, ABC):
         return self.rsample
 
     def kl(self, context: Tensor, prior: "BeliefHead", prior_context: Tensor) -> Tensor | None:
-        """Give KL(p(· | c) ‖ prior(· | prior_context)) in nats, `(*)`, where a closed form exists, else None."""
+        """Return KL(p(· | c) ‖ prior(· | prior_context)) in nats, `(*)`, where a closed form exists, else None."""
         return None
 
 

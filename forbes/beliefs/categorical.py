@@ -47,7 +47,7 @@ class CategoricalBelief(BeliefHead):
         self.logits_of = nn.Linear(context_dim, state_dim)
 
     def log_probabilities(self, context: Tensor) -> Tensor:
-        """Give log π, `(*, G, K)`."""
+        """Return log π, `(*, G, K)`."""
         return self._log_probabilities(self.logits_of(context))
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
@@ -84,12 +84,12 @@ class CategoricalBelief(BeliefHead):
 
 
 def one_hot_of(index: Tensor, like: Tensor) -> Tensor:
-    """Give rows of 0 with a 1 at the index, `(*, 1)`, in the shape and dtype of `like`; `one_hot` reads the values."""
+    """Return rows of 0 with a 1 at the index, `(*, 1)`, shaped and typed as `like`; `one_hot` reads the values."""
     return torch.zeros_like(like).scatter(-1, index, 1.0)
 
 
 def _scale_gradient(x: Tensor, share: float) -> Tensor:
-    """Give x, with so much of its gradient."""
+    """Return x, with so much of its gradient."""
     return torch.lerp(x.detach(), x, share)
 
 

@@ -42,22 +42,22 @@ class LULinear(nn.Module):
         self.bias = nn.Parameter(torch.zeros(dim))
 
     def triangles(self) -> tuple[Tensor, Tensor]:
-        """Give L and U, each `(D, D)`."""
+        """Return L and U, each `(D, D)`."""
         diagonal = softplus(self.raw_diagonal) + 1e-3
         unit = torch.eye(len(diagonal), dtype=diagonal.dtype, device=diagonal.device)
         return self.factors.tril(-1) + unit, self.factors.triu(1) + diagonal.diag()  # (D, D), (D, D)
 
     def log_det(self) -> Tensor:
-        """Give log|det LU| in nats, a scalar."""
+        """Return log|det LU| in nats, a scalar."""
         return (softplus(self.raw_diagonal) + 1e-3).log().sum()
 
     def matrix(self) -> Tensor:
-        """Give LU, `(D, D)`."""
+        """Return LU, `(D, D)`."""
         lower, upper = self.triangles()
         return lower @ upper
 
     def inverse_matrix(self) -> Tensor:
-        """Give (LU)⁻¹, `(D, D)`, by two triangular solves."""
+        """Return (LU)⁻¹, `(D, D)`, by two triangular solves."""
         lower, upper = self.triangles()
         unit = torch.eye(len(lower), dtype=lower.dtype, device=lower.device)
         z = torch.linalg.solve_triangular(lower, unit, upper=False, unitriangular=True)
@@ -95,7 +95,7 @@ class Coupling(nn.Module, ABC):
 
     @abstractmethod
     def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-        """Give x, `(*, D)`, and the forward log-slopes at it."""
+        """Return x, `(*, D)`, and the forward log-slopes at it."""
 
     def network(
         self, bind: Bind, weight: Tensor, bias: Tensor, then: Elementwise, mixing: LULinear | None = None, *more: Any
@@ -166,7 +166,7 @@ class AffineCoupling(Coupling):
         return self.network(bind_now, *self._last(), _move_back)(y, share)
 
     def _last(self) -> tuple[Tensor, Tensor]:
-        """Give weight and bias of the layer that writes (u/2, t), zeros for x_a: `(2 D, W)` and `(2 D,)`."""
+        """Return weight and bias of the layer that writes (u/2, t), zeros for x_a: `(2 D, W)` and `(2 D,)`."""
         around = (0, self.given) if self.swap else (self.given, 0)
         rows = (0, 0, *around)
         weight = torch.cat((pad(self.log_scale.weight / LOG_SCALE_BOUND, rows), pad(self.shift.weight, rows)))
@@ -256,7 +256,7 @@ def _join(of_x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
 
 @fused
 def _split_and_join(both: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Give x from what is x and its share, `(*, D + W)`, then as `_join`."""
+    """Return x from what is x and its share, `(*, D + W)`, then as `_join`."""
     width = share.shape[-1]
     x, of_x = both.split((both.shape[-1] - width, width), -1)  # (*, D), (*, W)
     hidden = of_x + share
@@ -265,20 +265,20 @@ def _split_and_join(both: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 @fused
 def _extend(inner: Tensor, hidden: Tensor) -> Tensor:
-    """Give the block's input and what its second layer reads, side by side, `(*, 2 W)`."""
+    """Return the block's input and what its second layer reads, side by side, `(*, 2 W)`."""
     return torch.cat((hidden, inner.relu()), -1)
 
 
 @fused
 def _move(raw: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Give y and ℓ from (u/2, t), `(*, 2 D)`, and x, `(*, D)`."""
+    """Return y and ℓ from (u/2, t), `(*, 2 D)`, and x, `(*, D)`."""
     log_scale, shift = _log_scale_and_shift(raw)
     return torch.addcmul(shift, x, log_scale.exp()), log_scale
 
 
 @fused
 def _move_back(raw: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Give x and ℓ from y, likewise."""
+    """Return x and ℓ from y, likewise."""
     log_scale, shift = _log_scale_and_shift(raw)
     return (y - shift) * (-log_scale).exp(), log_scale
 

@@ -14,7 +14,7 @@ __all__ = ["GaussianBelief", "standard_normal_log_prob"]
 
 
 def standard_normal_log_prob(noise: Tensor) -> Tensor:
-    """Give log N(ε; 0, I) in nats, summed over the last dimension: shape `(*, D)` to `(*)`."""
+    """Return log N(ε; 0, I) in nats, summed over the last dimension: shape `(*, D)` to `(*)`."""
     return -0.5 * (noise.square().sum(-1) + noise.shape[-1] * math.log(2 * math.pi))
 
 
@@ -41,7 +41,7 @@ class GaussianBelief(BeliefHead):
         self.parameters_of = nn.Linear(context_dim, 2 * state_dim)
 
     def moments(self, context: Tensor) -> tuple[Tensor, Tensor]:
-        """Give mean and standard deviation, each `(*, D)`."""
+        """Return mean and standard deviation, each `(*, D)`."""
         return _moments(self.parameters_of(context), self.min_std)
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
@@ -81,6 +81,6 @@ def _moments(parameters: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
 
 @fused
 def _place(parameters: Tensor, noise: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
-    """Give s, where its noise puts it, and its log-density."""
+    """Return s, where its noise puts it, and its log-density."""
     mean, std = _moments(parameters, min_std)
     return torch.addcmul(mean, std, noise), standard_normal_log_prob(noise) - std.log().sum(-1)

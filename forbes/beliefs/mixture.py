@@ -26,7 +26,7 @@ class Mixture(NamedTuple):
     """σ, `(*, M, D)`."""
 
     def log_prob(self, state: Tensor) -> Tensor:
-        """Give log p(s) in nats: shape `(*, D)` to `(*)`."""
+        """Return log p(s) in nats: shape `(*, D)` to `(*)`."""
         log_density = _standard_log_density((state.unsqueeze(-2) - self.mean) / self.std) - self.std.log()  # (*, M, D)
         return (self.log_weight + log_density.sum(-1)).logsumexp(-1)
 
@@ -66,7 +66,7 @@ class MixtureBelief(BeliefHead):
         self.parameters_of = nn.Linear(context_dim, components * (1 + 2 * state_dim))
 
     def mixture(self, context: Tensor) -> Mixture:
-        """Give the mixture of a context."""
+        """Return the mixture of a context."""
         return self._mixture(self.parameters_of(context))
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
@@ -91,7 +91,7 @@ class MixtureBelief(BeliefHead):
 
 
 def _standard_log_density(noise: Tensor) -> Tensor:
-    """Give log N(ε; 0, 1) of each number."""
+    """Return log N(ε; 0, 1) of each number."""
     return -0.5 * (noise.square() + math.log(2 * math.pi))
 
 
@@ -110,7 +110,7 @@ def _draw(mixture: Mixture, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor,
 
 
 def _reparameterised(mixture: Mixture, state: Tensor) -> Tensor:
-    r"""Give the same numbers with the gradient :math:`-J^{-1}\, \partial F / \partial\theta`, J lower triangular.
+    r"""Return the same numbers with the gradient :math:`-J^{-1}\, \partial F / \partial\theta`, J lower triangular.
 
     .. math:: J_{dj} = \frac{\partial F_d}{\partial s_j} = -\sum_m r_{md} (\Phi_{md} - F_d) \frac{s_j - \mu_{mj}}
               {\sigma_{mj}^2} \ (j < d), \qquad J_{dd} = p(s_d \mid s_{<d})

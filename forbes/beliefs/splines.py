@@ -108,14 +108,14 @@ def spline_inverse(y: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _bin_of(value: Tensor, table: Tensor, edge: int) -> tuple[Tensor, ...]:
-    """Give the six numbers, `(*)` each, of the bin in which a value `(*)` lies; edge 0 looks along x, 1 along y."""
+    """Return the six numbers, `(*)` each, of the bin in which a value `(*)` lies; edge 0 looks along x, 1 along y."""
     index = (value[..., None] >= table[..., edge, 1:]).sum(-1)  # (*)
     table = table.expand(*index.shape, *table.shape[-2:])  # (*, 6, K)
     return table.gather(-1, index[..., None, None].expand(*index.shape, 6, 1)).squeeze(-1).unbind(-1)  # 6 x (*)
 
 
 def _derivative(xi: Tensor, s: Tensor, slope: Tensor, next_slope: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Give the denominator :math:`q = s (1-2u) + (d_k + d_{k+1}) u`, at least s/2, and the log-slope.
+    r"""Return the denominator :math:`q = s (1-2u) + (d_k + d_{k+1}) u`, at least s/2, and the log-slope.
 
     .. math:: \log \frac{\partial y}{\partial x} = \log \frac{s^2 (d_{k+1} \xi^2 + 2 s u + d_k (1-\xi)^2)}{q^2}
     """

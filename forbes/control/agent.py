@@ -86,7 +86,7 @@ def explore(actor: Actor, amount: float) -> Choice:
 
 
 def _agreed(action: Tensor, discrete: bool) -> Tensor:
-    """Give the mean of K actions, or the commonest, `(K, A)` to `(1, A)`."""
+    """Return the mean of K actions, or the commonest, `(K, A)` to `(1, A)`."""
     mean = action.mean(0, keepdim=True)  # (1, A)
     return one_hot_of(mean.argmax(-1, keepdim=True), mean) if discrete else mean
 

@@ -18,7 +18,7 @@ __all__ = ["belief_samples"]
 
 
 def belief_samples(model: StateSpaceModel, filtered: Filtered, number: int) -> State:
-    """Give N samples of the belief at each step of each sequence, as constants: `(N, B, T, …)`.
+    """Return N samples of the belief at each step of each sequence, as constants: `(N, B, T, …)`.
 
     The first is the filter's own trajectory, so that N = 1 is Dreamer.
     """

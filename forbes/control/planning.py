@@ -50,7 +50,7 @@ class CrossEntropy(NamedTuple):
 def plan(
     model: StateSpaceModel, reward: Callable[[Tensor], Tensor], start: State, action_dim: int, search: CrossEntropy
 ) -> Tensor:
-    """Give the actions to take now: the first of the best sequences, by the sum of mean rewards of what they lead to.
+    """Return the actions to take now: the first of the best sequences, by the sum of mean rewards of what they lead to.
 
     Args:
         model: imagines.

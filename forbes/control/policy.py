@@ -24,7 +24,7 @@ class Policy(Protocol):
         """Draw an action with a gradient, and its log-probability in nats: `(*, A)` and `(*)`."""
 
     def mode(self) -> Tensor:
-        """Give the most probable action, `(*, A)`."""
+        """Return the most probable action, `(*, A)`."""
 
 
 class TanhNormal:
@@ -49,7 +49,7 @@ class TanhNormal:
         return _squeeze(noise, self.mean, self.std)
 
     def mode(self) -> Tensor:
-        """Give the most probable of 100 samples, each distribution's own, `(*, A)`: there is no closed form."""
+        """Return the most probable of 100 samples, each distribution's own, `(*, A)`: there is no closed form."""
         action, log_prob = self.rsample((_MODE_SAMPLES,))
         best = log_prob.argmax(0)  # (*)
         return action.gather(0, best[None, ..., None].expand(1, *action.shape[1:])).squeeze(0)  # (*, A)
@@ -57,7 +57,7 @@ class TanhNormal:
 
 @fused
 def _squeeze(noise: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-    """Give the action that noise makes, `(*, A)`, and its log-probability, `(*)`."""
+    """Return the action that noise makes, `(*, A)`, and its log-probability, `(*)`."""
     before = torch.addcmul(mean, std, noise)  # (*, A)
     density = -0.5 * (noise.square() + math.log(2 * math.pi)) - std.log()
     log_prob = (density - 2 * (_LOG_2 - before - softplus(-2 * before))).sum(-1)  # (*)
@@ -66,7 +66,7 @@ def _squeeze(noise: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
 
 @fused
 def _bounded(numbers: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
-    """Give mean and standard deviation before the tanh, from (x, y)."""
+    """Return mean and standard deviation before the tanh, from (x, y)."""
     mean, std = numbers.chunk(2, -1)  # 2 x (*, A)
     return 5 * torch.tanh(mean / 5), softplus(std + math.log(math.expm1(5))) + min_std
 
@@ -122,7 +122,7 @@ class Actor(nn.Module):
         self.head = nn.Linear(width, action_dim if discrete else 2 * action_dim)
 
     def forward(self, features: Tensor) -> Policy:
-        """Give the policy at features, `(*, F)`."""
+        """Return the policy at features, `(*, F)`."""
         numbers: Tensor = self.head(self.hidden(features))
         if self.discrete:
             return OneHotCategorical(numbers)
@@ -143,6 +143,6 @@ class ScalarHead(nn.Module):
         self.net = nn.Sequential(Perceptron(feature_dim, width, layers), nn.Linear(width, 1))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Give the number, `(*, F)` to `(*)`."""
+        """Return the number, `(*, F)` to `(*)`."""
         number: Tensor = self.net(features).to(features.dtype)
         return number.squeeze(-1)  # (*)

@@ -41,7 +41,7 @@ def lambda_returns(reward: Tensor, value: Tensor, discount: Tensor, lambda_: flo
 
 
 def actor_loss(returns: Tensor, discount: Tensor, valid: Tensor) -> Tensor:
-    r"""Give :math:`-\overline{w_\tau V_\tau}` over trajectories and states (paper, J_Actor; weights: Dreamer).
+    r"""Return :math:`-\overline{w_\tau V_\tau}` over trajectories and states (paper, J_Actor; weights: Dreamer).
 
     .. math:: w_\tau = \textstyle\prod_{k < \tau} \gamma_k
 
@@ -54,7 +54,7 @@ def actor_loss(returns: Tensor, discount: Tensor, valid: Tensor) -> Tensor:
 
 
 def critic_loss(value: Tensor, returns: Tensor, discount: Tensor, valid: Tensor) -> Tensor:
-    r"""Give :math:`\overline{w_\tau \tfrac12 (v_\tau - \mathrm{sg}(V_\tau))^2}` (paper, J_Critic).
+    r"""Return :math:`\overline{w_\tau \tfrac12 (v_\tau - \mathrm{sg}(V_\tau))^2}` (paper, J_Critic).
 
     Args:
         value: :math:`v(s_\tau)` of the states that have a return, `(*, H - 1)`.

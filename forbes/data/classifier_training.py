@@ -74,7 +74,7 @@ def train_classifiers(sources: Mapping[str, Strokes]) -> dict[str, DigitClassifi
 
 
 def digits_of(source: Strokes, split: Split) -> Digits:
-    """Give the digits of a split."""
+    """Return the digits of a split."""
     arrays = source.arrays(split)
     points = np.diff(arrays.offsets)  # (N,)
     digit = np.repeat(np.arange(len(points)), points)  # (P,)

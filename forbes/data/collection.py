@@ -100,7 +100,7 @@ def collect_episodes(
 
 
 def episode_seed(seed: int, number: int, purpose: str = "episode") -> int:
-    """Give the seed of an episode and of its policy; `purpose` keeps those that measure apart from those collected."""
+    """Return the seed of an episode and its policy; `purpose` keeps those that measure apart from those collected."""
     return derive_seed(seed, purpose, number) % 2**32  # what numpy's older generators take
 
 
@@ -124,7 +124,7 @@ def play_whole(
 
 
 def describe_environment(environment: Environment) -> dict[str, Any]:
-    """Give all that the record of an episode says of its environment."""
+    """Return all that the record of an episode says of its environment."""
     return environment.describe() | {
         "observation_shape": list(environment.observation_shape),
         "action_dim": environment.action_dim,

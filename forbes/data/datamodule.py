@@ -112,7 +112,7 @@ class SequenceDataModule(LightningDataModule):
         return self.source.discrete
 
     def state_dict(self) -> dict[str, Any]:
-        """Give what a checkpoint must hold for the same batches: how far a growing source was read."""
+        """Return what a checkpoint must hold for the same batches: how far a growing source was read."""
         return {} if self.source.watermark is None else {"watermark": self.source.watermark}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -120,23 +120,23 @@ class SequenceDataModule(LightningDataModule):
         self.source.watermark = state_dict["watermark"]
 
     def train_index(self, number: int) -> Tensor:
-        """Give the indices of one training batch, `(B,)`, int64."""
+        """Return the indices of one training batch, `(B,)`, int64."""
         return self.source.train_index(self.batch_size, self.length, self.seed, number)
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Give `updates_per_epoch` batches, after those that the trainer has taken."""
+        """Return `updates_per_epoch` batches, after those that the trainer has taken."""
         return self._loader("train", _TrainIndices(self))
 
     def val_dataloader(self) -> DataLoader[Any]:
-        """Give the first `validation_sequences` of the validation split, in order."""
+        """Return the first `validation_sequences` of the validation split, in order."""
         return self._ordered("validation", self.validation_sequences)
 
     def test_dataloader(self) -> DataLoader[Any]:
-        """Give the whole test split, in order."""
+        """Return the whole test split, in order."""
         return self._ordered("test", None)
 
     def predict_dataloader(self) -> DataLoader[Any]:
-        """Give the whole test split, in order."""
+        """Return the whole test split, in order."""
         return self.test_dataloader()
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> SequenceBatch:
@@ -144,7 +144,7 @@ class SequenceDataModule(LightningDataModule):
         return self._decode(batch)
 
     def sequences(self, split: Split, index: Tensor, length: int | None = None) -> SequenceBatch:
-        """Give chosen sequences of a split on the CPU, cut or padded to `length` (the module's own by default)."""
+        """Return chosen sequences of a split on the CPU, cut or padded to `length` (the module's own by default)."""
         return self._decode(self.source.gather(split, index, length or self.length))
 
     def _decode(self, compact: Any) -> SequenceBatch:

@@ -56,7 +56,7 @@ class DigitClassifier(nn.Module):
         )
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Give log p(y | frames) in nats: grey values in [0, 1], `(*, C, H, W)`, to `(*, 10)`."""
+        """Return log p(y | frames) in nats: grey values in [0, 1], `(*, C, H, W)`, to `(*, 10)`."""
         logits: Tensor = self.net(frames.flatten(0, -4).float())  # (N, 10)
         return logits.log_softmax(-1).view(*frames.shape[:-3], CLASSES)  # (*, 10)
 

@@ -102,7 +102,7 @@ class EpisodeStore:
         self._mapped = {key: episode for key, episode in self._mapped.items() if key in here}
 
     def file(self, number: int) -> Path:
-        """Give the path of an episode."""
+        """Return the path of an episode."""
         return self.path / f"{number:06d}.npz"
 
     def files(self) -> list[int]:
@@ -270,7 +270,7 @@ class EpisodeWriter(EpisodeStore):
 
 
 def first_held(records: Iterable[EpisodeRecord], capacity: int | None) -> int:
-    """Give the number of the oldest episode that a replay of so many agent steps holds; the latest is always held."""
+    """Return the number of the oldest episode that a replay of so many agent steps holds; the latest is always held."""
     first, steps = 0, 0
     for record in reversed(list(records)):
         steps += record.steps

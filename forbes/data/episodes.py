@@ -109,7 +109,7 @@ class EpisodeRecord(NamedTuple):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Give what all the episodes of a store must have in common."""
+        """Return what all the episodes of a store must have in common."""
         settings = {"time_limit": TIME_LIMIT} | self.environment  # which records of older versions do not say
         return {name: value for name, value in settings.items() if name != "made_by"}
 
@@ -162,7 +162,7 @@ def problem_with(environment: dict[str, Any], episode: Episode) -> str:
 
 
 def pack_episode(episode: Episode, about: dict[str, Any]) -> bytes:
-    """Give the content of the file; the same episode gives the same bytes."""
+    """Return the content of the file; the same episode gives the same bytes."""
     content = io.BytesIO()
     arrays = {name: getattr(episode, name) for name in _ARRAYS}
     np.savez(content, allow_pickle=False, **arrays, meta=np.array(json.dumps(about)))

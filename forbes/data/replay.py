@@ -129,7 +129,7 @@ class Replay(SequenceSource):
         return 1 if split == "train" else self.stride
 
     def split_of(self, number: int) -> Split:
-        """Give the split of an episode; it depends on its number only, so it never changes."""
+        """Return the split of an episode; it depends on its number only, so it never changes."""
         if self.hold_out == 0 or (place := self.hold_out - 1 - number % self.hold_out) > 1:
             return "train"
         return "validation" if place else "test"
@@ -153,7 +153,7 @@ class Replay(SequenceSource):
         return (table.ends - table.lengths)[episode] + start  # a training window begins at every observation
 
     def latest(self, count: int) -> Tensor:
-        """Give the windows that the newest episodes begin with, the newest first, int64 `(count,)` or fewer."""
+        """Return the windows that the newest episodes begin with, the newest first, int64 `(count,)` or fewer."""
         table = self._require("train")
         return (table.ends - table.lengths).flip(0)[:count]  # a training window begins at every observation
 
@@ -186,7 +186,7 @@ class Replay(SequenceSource):
         return SequenceBatch(observation, action, reward, mask, reward.new_zeros(*reward.shape, 0), ended)
 
     def _require(self, split: Split) -> _Table:
-        """Give a split that has episodes."""
+        """Return a split that has episodes."""
         table = self._tables[split]
         if not table.numbers:
             raise ForbesError(

@@ -61,7 +61,7 @@ class Simulated(SequenceSource):
         self._drawn: dict[tuple[Split, int], Trajectories] = {}
 
     def trajectories(self, split: Split, length: int) -> Trajectories:
-        """Give all sequences of a split with their hidden states, float64; they depend on the length, too."""
+        """Return all sequences of a split with their hidden states, float64; they depend on the length, too."""
         if (split, length) not in self._drawn:
             self._drawn[split, length] = self._draw(split, self.size(split), length)
         return self._drawn[split, length]

@@ -79,7 +79,7 @@ class SequenceSource(Named, ABC):
         """Turn what `gather` returned into a batch, on the device it lies on."""
 
     def train_index(self, batch_size: int, length: int, seed: int, update: int) -> Tensor:
-        """Give the indices of one training batch, int64 `(B,)`: shuffled passes over the split, without replacement.
+        """Return the indices of one training batch, int64 `(B,)`: shuffled passes over the split, without replacement.
 
         Args:
             batch_size: B.
@@ -111,7 +111,7 @@ class SequenceSource(Named, ABC):
         return 1 - (1 - observation).cumprod(1, dtype=observation.dtype)
 
     def latest(self, count: int) -> Tensor:
-        """Give training sequences to look at, those first that were learned from least; int64 `(count,)` or fewer."""
+        """Return training sequences to look at, those first that were learned from least; int64 `(count,)` or fewer."""
         return torch.arange(min(count, self.size("train")))
 
 

@@ -72,7 +72,7 @@ def trace(line: NDArray[np.bool_]) -> list[Stroke]:
 
 
 def _connect(pixels: Iterable[Pixel]) -> Graph:
-    """Give each pixel's neighbours; a corner counts only where no side leads round it, so there are no triangles."""
+    """Return each pixel's neighbours; a corner counts only where no side leads round it, so there are no triangles."""
     graph: Graph = {pixel: [] for pixel in sorted(pixels)}
     for x, y in graph:
         sides = [(x, y - 1), (x - 1, y), (x + 1, y), (x, y + 1)]

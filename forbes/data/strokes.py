@@ -125,11 +125,11 @@ class Strokes(SequenceSource):
         return len(self._splits[split].labels)
 
     def arrays(self, split: Split) -> StrokeArrays:
-        """Give a split's pen paths, pen lifts included."""
+        """Return a split's pen paths, pen lifts included."""
         return self._splits[split]
 
     def labels(self, split: Split) -> Tensor:
-        """Give the class of each digit of a split, int64 (N,)."""
+        """Return the class of each digit of a split, int64 (N,)."""
         return torch.from_numpy(self._splits[split].labels).long()
 
     def steps(self, split: Split) -> Tensor:

@@ -70,7 +70,7 @@ class Environment(ABC):
         """Act, float32 `(A,)`."""
 
     def describe(self) -> dict[str, Any]:
-        """Give what determines the episodes, as plain values, for the record.
+        """Return what determines the episodes, as plain values, for the record.
 
         `made_by` holds what another machine may have otherwise: versions, renderer. The rest must be the same for
         episodes to be mixed.

@@ -92,7 +92,7 @@ class KnownProcess(Environment):
 
 
 def _numbers(belief: ExactBelief) -> Tensor:
-    """Give what determines the last of a sequence's beliefs, `(O,)`."""
+    """Return what determines the last of a sequence's beliefs, `(O,)`."""
     if isinstance(belief, CategoricalBelief):
         return belief.mean[0, -1]  # (S,)
     if not isinstance(belief, GaussianMixtureBelief):

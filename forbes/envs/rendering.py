@@ -74,7 +74,7 @@ def probe_backend(backend: str, timeout: float = TIME_LIMIT) -> Probe:
 
 @lru_cache(maxsize=1)
 def choose_backend() -> Probe:
-    """Give the backend of `MUJOCO_GL`, else the first that renders; each process asks once, that of an environment too.
+    """Return the backend of `MUJOCO_GL`, else the first that renders; each process asks once, an environment's too.
 
     Raises:
         ForbesError: when none renders.

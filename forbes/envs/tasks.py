@@ -51,7 +51,7 @@ _NAMED: dict[str, Callable[..., Environment]] = {
 
 
 def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
-    """Give what makes the environment of a task; it can be sent to another process.
+    """Return what makes the environment of a task; it can be sent to another process.
 
     Args:
         task: as `TASKS` says.

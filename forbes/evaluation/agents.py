@@ -122,7 +122,7 @@ def _play(
 
 
 def _known_process(environment: EnvironmentProcess) -> Process | None:
-    """Give the process behind an environment that shows its observations, if its belief is known exactly."""
+    """Return the process behind an environment that shows its observations, if its belief is known exactly."""
     if environment.describe().get("shows") != "observation":
         return None
     known = environment.make()

@@ -79,7 +79,7 @@ def _load(path: str) -> _Run:
 
 
 def _same_data(runs: Sequence[_Run], args: Any) -> str:
-    """Give the hash of the sequences; refuse runs with others, or with too few."""
+    """Return the hash of the sequences; refuse runs with others, or with too few."""
     hashes = []
     for run in runs:
         size = run.data.source.size(args.split)
@@ -162,7 +162,7 @@ def _table(args: Any) -> Table:
 
 
 def _row(name: str, belief: str, scores: Scores) -> list[str]:
-    """Give a row of the table; a metric that a process or a belief does not have is left empty."""
+    """Return a row of the table; a metric that a process or a belief does not have is left empty."""
     cells = []
     for metric in (*ERRORS, "elbo_gap"):
         values = scores.values.get(metric)

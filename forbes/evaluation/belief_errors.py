@@ -42,7 +42,7 @@ class Belief(Protocol):
         """Draw s_t, `(count, B, T, D)`."""
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Give its log-density in nats: `(..., B, T, D)` to `(..., B, T)`."""
+        """Return its log-density in nats: `(..., B, T, D)` to `(..., B, T)`."""
 
 
 class _Nodes(NamedTuple):
@@ -98,7 +98,7 @@ def belief_errors(
 
 
 def mode_centres(process: Process) -> Tensor | None:
-    """Give a point in each mode that a belief of the process can have, `(K, D)`, None where it has one.
+    """Return a point in each mode that a belief of the process can have, `(K, D)`, None where it has one.
 
     The signs that an even sensor cannot see, the two sides of the light, and the corners where a hiker may have started
     and, with steps of at most 0.05, for long still is.
@@ -113,7 +113,7 @@ def mode_centres(process: Process) -> Tensor | None:
 
 
 def moment_matched(exact: ExactBelief) -> GaussianMixtureBelief:
-    """Give the diagonal Gaussian of the same mean and variance: of all diagonal ones that with the least forward KL."""
+    """Return the diagonal Gaussian with the same mean and variance, which has the least forward KL of all of them."""
     mean = exact.mean.unsqueeze(-2)  # (B, T, 1, D)
     return GaussianMixtureBelief(mean.new_zeros(mean.shape[:-1]), mean, exact.variance.diag_embed())
 
@@ -144,7 +144,7 @@ def _expectation(weight: Tensor, values: Tensor) -> Tensor:
 
 
 def _variance(point: Tensor, weight: Tensor) -> Tensor:
-    """Give the trace of the variance, `(N, *, D)` and `(N, *)` to `(*)`."""
+    """Return the trace of the variance, `(N, *, D)` and `(N, *)` to `(*)`."""
     share = (weight / weight.sum(0)).unsqueeze(-1)  # (N, *, 1)
     mean = (share * point).sum(0)  # (*, D)
     return (share * (point - mean).square()).sum((0, -1))

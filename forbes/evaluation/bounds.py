@@ -61,12 +61,12 @@ class LogMeanExp:
         self.total = torch.logaddexp(self.total.to(value.device), value)
 
     def result(self) -> Tensor:
-        """Give the log-mean-exp of what was added."""
+        """Return the log-mean-exp of what was added."""
         return self.total - math.log(self.number)
 
 
 def frame_log_prob(model: BeliefModel, features: Tensor, target: Tensor) -> Tensor:
-    """Give log p(o | features) in nats, float64, a few frames at a time.
+    """Return log p(o | features) in nats, float64, a few frames at a time.
 
     Args:
         model: decodes the features.

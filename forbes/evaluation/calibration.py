@@ -135,7 +135,7 @@ def _accuracy(label: Tensor, neighbours: Tensor) -> float:
 
 
 def _scale(values: Tensor) -> Tensor:
-    """Give the standard deviation of each dimension, `(N, D)` to `(D,)`; 1 where there is none."""
+    """Return the standard deviation of each dimension, `(N, D)` to `(D,)`; 1 where there is none."""
     deviation = values.std(0)
     return torch.where(deviation > 0, deviation, 1)
 

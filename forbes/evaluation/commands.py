@@ -177,7 +177,7 @@ def _of(run: TrainedRun, jobs: Sequence[_Job]) -> list[_Job]:
 
 
 def _count(run: TrainedRun, args: Any, default: int) -> int:
-    """Give the number of sequences to score."""
+    """Return the number of sequences to score."""
     size = run.data.source.size(args.split)
     wanted = min(default, size) if args.sequences is None else args.sequences
     if sys.maxsize > wanted > size:

@@ -94,7 +94,7 @@ def _entries(family: Family, metric: str) -> list[dict[str, Any]]:
 
 
 def _blank(other: dict[str, Any]) -> dict[str, Any]:
-    """Give the entry of a metric that a run's model does not have, beside that of another."""
+    """Return the entry of a metric that a run's model does not have, beside that of another."""
     return other | {"mean": math.nan, "standard_error": math.nan, "per_step": {"mean": math.nan}}
 
 
@@ -125,7 +125,7 @@ def _row(family: Family, metric: str, seed: int, entry: dict[str, Any]) -> dict[
 
 
 def _paired(family: Family, first: Family, metric: str) -> list[dict[str, Any]]:
-    """Give the paired differences of the seeds that both families have."""
+    """Return the paired differences of the seeds that both families have."""
     rows = []
     for seed in (seed for seed in family.runs if seed in first.runs):
         one, other = (_array(run, metric) for run in (family.runs[seed], first.runs[seed]))

@@ -15,13 +15,13 @@ _GREY = (0.1, 0.9)
 
 
 def entropy(p: Tensor) -> Tensor:
-    r"""Give :math:`H[p] = -\sum_y p(y) \log p(y)` in nats, `(*, Y)` to `(*)`."""
+    r"""Return :math:`H[p] = -\sum_y p(y) \log p(y)` in nats, `(*, Y)` to `(*)`."""
     total: Tensor = torch.special.entr(p.double()).sum(-1)
     return total
 
 
 def jensen_shannon(p: Tensor, q: Tensor) -> Tensor:
-    r"""Give the Jensen-Shannon divergence in nats, `(*, Y)` twice to `(*)`: 0 for equal distributions, at most log 2.
+    r"""Return the Jensen-Shannon divergence in nats, `(*, Y)` twice to `(*)`: 0 for equal distributions, at most log 2.
 
     .. math:: \mathrm{JS}(p, q) = H\big[\tfrac12 (p + q)\big] - \tfrac12 H[p] - \tfrac12 H[q]
     """
@@ -29,7 +29,7 @@ def jensen_shannon(p: Tensor, q: Tensor) -> Tensor:
 
 
 def energy_score(samples: Tensor, truth: Tensor) -> Tensor:
-    r"""Give the energy score, proper for all pixels jointly; less is better (Gneiting and Raftery, 2007).
+    r"""Return the energy score, proper for all pixels jointly; less is better (Gneiting and Raftery, 2007).
 
     .. math:: \frac1N \sum_k \lVert x_k - y \rVert - \frac1{2N(N-1)} \sum_{k \ne l} \lVert x_k - x_l \rVert
 
@@ -47,7 +47,7 @@ def energy_score(samples: Tensor, truth: Tensor) -> Tensor:
 
 
 def crps(means: Tensor, truth: Tensor) -> Tensor:
-    r"""Give the continuous ranked probability score of each pixel, summed over pixels; less is better.
+    r"""Return the continuous ranked probability score of each pixel, summed over pixels; less is better.
 
     .. math:: \sum_i \mathrm E|X_i - y_i| - \tfrac12 \mathrm E|X_i - X'_i| = \sum_i (p_i - y_i)^2, \qquad
               p_i^2 \approx \frac1{N(N-1)} \sum_{k \ne l} x_{ki} x_{li}
@@ -67,7 +67,7 @@ def crps(means: Tensor, truth: Tensor) -> Tensor:
 
 
 def best_of(errors: Tensor) -> Tensor:
-    r"""Give the expected least error of n completions out of N, for every n, over all subsets at once.
+    r"""Return the expected least error of n completions out of N, for every n, over all subsets at once.
 
     .. math:: \sum_k e_{(k)} \binom{N - k}{n - 1} \Big/ \binom Nn, \qquad e_{(1)} \le \dots \le e_{(N)}
 
@@ -85,7 +85,7 @@ def best_of(errors: Tensor) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _least_of(count: int) -> Tensor:
-    """Give the probability that the k-th smallest of N is the least of n, `(N, N)` over k and n."""
+    """Return the probability that the k-th smallest of N is the least of n, `(N, N)` over k and n."""
     chances = [
         [math.comb(count - k, n - 1) / math.comb(count, n) for n in range(1, count + 1)] for k in range(1, count + 1)
     ]
@@ -93,7 +93,7 @@ def _least_of(count: int) -> Tensor:
 
 
 def average_of(means: Tensor, truth: Tensor) -> Tensor:
-    r"""Give the expected squared error of the average picture of n completions out of N, for every n.
+    r"""Return the expected squared error of the average picture of n completions out of N, for every n.
 
     .. math:: \lVert \bar x - y \rVert^2 + \Big(\frac1n - \frac1N\Big) \frac1{N-1} \sum_k \lVert x_k - \bar x \rVert^2
 
@@ -116,7 +116,7 @@ def average_of(means: Tensor, truth: Tensor) -> Tensor:
 
 
 def grey_ink(means: Tensor) -> Tensor:
-    r"""Give the share of a picture's ink that is grey, `(*, P)` to `(*)`: 0 for a binary picture, high for a blur.
+    r"""Return the share of a picture's ink that is grey, `(*, P)` to `(*)`: 0 for a binary picture, high for a blur.
 
     .. math:: \sum_i x_i\, 1[0.1 < x_i < 0.9] \Big/ \sum_i x_i
     """
@@ -127,7 +127,7 @@ def grey_ink(means: Tensor) -> Tensor:
 
 
 def ratio_values(part: Tensor, whole: Tensor) -> Tensor:
-    r"""Give a value for each sequence whose mean is a ratio of sums, and whose standard error is the ratio's.
+    r"""Return a value for each sequence whose mean is a ratio of sums, and whose standard error is the ratio's.
 
     .. math:: v_i = R + \frac{a_i - R\,b_i}{\bar b}, \qquad R = \sum_i a_i \Big/ \sum_i b_i
 

@@ -55,7 +55,7 @@ class Study(NamedTuple):
 
     @property
     def differences(self) -> list[tuple[Row, Row, dict[str, Estimate]]]:
-        """Give the mean difference of the first run to each other one, paired over digits."""
+        """Return the mean difference of the first run to each other one, paired over digits."""
         first = self.runs[0]
         return [
             (first, other, {name: Estimate.of(values - other.scores[name]) for name, values in first.scores.items()})

@@ -68,7 +68,7 @@ class Prefixes(NamedTuple):
     """r(y | o_1:c), float64 (B, 10)."""
 
     def batches(self, data: SequenceDataModule, split: Split) -> Iterator[tuple[int, SequenceBatch]]:
-        """Give the digits to their end, some at a time, with the place of the first."""
+        """Return the digits to their end, some at a time, with the place of the first."""
         for place in torch.arange(len(self.digits)).split(_ROWS):
             yield int(place[0]), data.sequences(split, self.digits[place], int(self.steps.max()))
 
@@ -188,7 +188,7 @@ def judge_completions(
 
 
 def _pixels(frames: Tensor, batch: SequenceBatch, context: int, step: Tensor) -> tuple[Tensor, Tensor]:
-    """Give completions and truth at a step of each digit, counted from 1, `(B,)`: `(N, B, P)` and `(B, P)`."""
+    """Return completions and truth at a step of each digit, counted from 1, `(B,)`: `(N, B, P)` and `(B, P)`."""
     digit = torch.arange(len(step))
     return frames[:, digit, step - context - 1].flatten(2), batch.observation[digit, step - 1].float().flatten(1)
 
@@ -209,7 +209,7 @@ def _classes_at(frames: Tensor, batch: SequenceBatch, context: int, step: Tensor
 
 
 def summarise(readings: Increments, prefixes: Prefixes, length: int) -> dict[str, Tensor]:
-    """Give the scores of each digit, `(B,)`, by name and step, from what was read of its completions."""
+    """Return the scores of each digit, `(B,)`, by name and step, from what was read of its completions."""
     scores = summarise_classes(readings["classes"], prefixes) | {"clear[end]": readings["clear"][:, 0]}
     for share in _SHARES:
         kept, early = (readings[f"{name} {share}"][:, 0] for name in ("kept", "early"))
@@ -223,7 +223,7 @@ def summarise(readings: Increments, prefixes: Prefixes, length: int) -> dict[str
 
 
 def summarise_classes(classes: Tensor, prefixes: Prefixes) -> dict[str, Tensor]:
-    """Give the scores of a distribution of the class, `(B, 10)`, for each digit, `(B,)`."""
+    """Return the scores of a distribution of the class, `(B, 10)`, for each digit, `(B,)`."""
     own = classes.gather(1, prefixes.labels[:, None])[:, 0]  # (B,)
     return {
         "js[end]": jensen_shannon(classes, prefixes.reference),

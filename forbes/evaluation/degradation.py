@@ -35,7 +35,7 @@ def degradation(curves: Curves) -> dict[str, dict[str, list[float]]]:
 
 
 def at_horizons(metric: str, curves: Mapping[str, Sequence[float]]) -> dict[str, dict[int, float]]:
-    """Give by model what the degradation is 1, 2, 5, 10 steps after the context, and at the end."""
+    """Return, by model, what the degradation is 1, 2, 5, 10 steps after the context, and at the end."""
     context = _context(metric)
     end = len(next(iter(curves.values()))) - context
     horizons = [*(horizon for horizon in _HORIZONS if horizon < end), end]

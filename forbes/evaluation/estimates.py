@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
 
 
 def bootstrap_interval(values: Tensor, level: float = 0.95, seed: int = 0) -> tuple[float, float]:
-    """Give the percentile bootstrap interval of the mean over sequences, `(N,)`: it need not be symmetric."""
+    """Return the percentile bootstrap interval of the mean over sequences, `(N,)`: it need not be symmetric."""
     draw = generator(seed, "bootstrap", len(values))
     index = torch.randint(len(values), (_RESAMPLES, len(values)), generator=draw)  # (R, N)
     tail = (1 - level) / 2

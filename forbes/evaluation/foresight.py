@@ -61,7 +61,7 @@ def foretell(
 
 
 def explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor]) -> list[Estimate | None]:
-    r"""Give the share of the rewards' variance that was foretold, for each distance k.
+    r"""Return the share of the rewards' variance that was foretold, for each distance k.
 
     .. math:: R^2_k = 1 - \frac{\sum (r_t - \hat r_{t \mid t-k})^2}{\sum (r_t - \bar r)^2}
 
@@ -78,7 +78,7 @@ def explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor]) -
 
 
 def share_explained(foretold: Sequence[Tensor], rewards: Sequence[Tensor]) -> float | None:
-    """Give the share of one distance as `explained` does; without an error, so that one episode will do."""
+    """Return the share of one distance as `explained` does; without an error, so that one episode will do."""
     missed, there = _squares(foretold, rewards)
     return 1 - (missed.sum() / there.sum()).item() if there.sum() > 0 else None
 

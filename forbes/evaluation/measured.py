@@ -35,7 +35,7 @@ class Pair(NamedTuple):
 
 
 def score_of(metric: str) -> str:
-    """Give the score of a full name: `test[:1000]/pll[bernoulli,K=128]` to `pll`."""
+    """Return the score of a full name: `test[:1000]/pll[bernoulli,K=128]` to `pll`."""
     return metric.partition("/")[2].partition("[")[0]
 
 

@@ -23,7 +23,7 @@ class Completions(NamedTuple):
     """Steps that the model saw."""
 
     def at(self, time: int) -> Tensor:
-        """Give the frames of step `time`, counted from 1 as in the paper, `(N, B, C, H, W)`."""
+        """Return the frames of step `time`, counted from 1 as in the paper, `(N, B, C, H, W)`."""
         return self.frames[:, :, time - self.context - 1]
 
 
@@ -123,7 +123,7 @@ def complete(
 
 @torch.no_grad()
 def open_loop(model: StateSpaceModel, batch: SequenceBatch, context: int) -> Tensor:
-    """Give E[o_t | features] in [0, 1], `(B, T, C, H, W)`, along one trajectory of each sequence.
+    """Return E[o_t | features] in [0, 1], `(B, T, C, H, W)`, along one trajectory of each sequence.
 
     Up to `context` the features are the posterior's, which has seen o_t; later ones are the prior's, rolled on from the
     belief at `context` by the actions that were taken.
@@ -140,7 +140,7 @@ def open_loop(model: StateSpaceModel, batch: SequenceBatch, context: int) -> Ten
 
 
 def whole_sequences(data: SequenceDataModule, split: Split, index: Tensor) -> SequenceBatch:
-    """Give sequences up to the end of the longest, but no shorter than the module's own length."""
+    """Return sequences up to the end of the longest, but no shorter than the module's own length."""
     length = data.length
     while (batch := data.sequences(split, index, length)).mask[:, -1].any():
         length *= 2

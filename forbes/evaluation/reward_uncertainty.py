@@ -27,7 +27,7 @@ DRAWS = 256
 
 
 def exact_variance(process: Process, episode: Episode, seed: int) -> Tensor:
-    r"""Give the variance of each reward under the exact belief, by draws that are weighed by what was seen.
+    r"""Return the variance of each reward under the exact belief, by draws that are weighed by what was seen.
 
     .. math:: s_{t-1}^k \sim p(\cdot \mid o_{1:t-1}, a_{1:t-2}), \quad
               s_t^k \sim p(\cdot \mid s_{t-1}^k, a_{t-1}), \quad w_t^k \propto p(o_t \mid s_t^k)
@@ -52,13 +52,13 @@ def exact_variance(process: Process, episode: Episode, seed: int) -> Tensor:
 
 
 def learned_variance(agent: ActingModel, episode: Episode, seed: int) -> Tensor:
-    """Give the variance of each reward over trajectories of an agent's belief, in squared units of reward, `(T,)`."""
+    """Return the variance of each reward over trajectories of an agent's belief, in squared units of reward, `(T,)`."""
     with followed(agent, episode, DRAWS, seed) as (filtered, _):
         reward: Tensor = agent.reward(filtered.features)[:, 1:]  # (S, T)
         return reward.double().var(0).cpu()
 
 
 def uncertainty(learned: Sequence[Tensor], exact: Sequence[Tensor]) -> Estimate:
-    """Give u of E episodes, at least 2, with the error of a ratio over them."""
+    """Return u of E episodes, at least 2, with the error of a ratio over them."""
     sums = (torch.stack([one.sum() for one in variances]) for variances in (learned, exact))  # 2 x (E,)
     return Estimate.per_step(*sums)

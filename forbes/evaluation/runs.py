@@ -97,7 +97,7 @@ def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
 
 
 def _kind(model: BeliefModel) -> type[nn.Module]:
-    """Give what tells families apart: the belief's, or the model's where its filter is another."""
+    """Return what tells families apart: the belief's, or the model's where its filter is another."""
     if type(model) is not StateSpaceModel:
         return type(model)
     prior, posterior = model.prior, model.posterior
@@ -112,7 +112,7 @@ def _without_seed(section: dict[str, Any]) -> dict[str, Any]:
 def split_batches(
     data: SequenceDataModule, split: Split, sequences: int, batch_size: int
 ) -> Iterator[tuple[int, SequenceBatch]]:
-    """Give the first so many sequences of a split in order, with the index of each batch's first."""
+    """Return the first so many sequences of a split in order, with the index of each batch's first."""
     for index in torch.arange(sequences).split(batch_size):
         yield int(index[0]), data.sequences(split, index)
 

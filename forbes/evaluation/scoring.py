@@ -65,7 +65,7 @@ class Scores(NamedTuple):
         return self.mask.sum(1)
 
     def total(self, metric: str) -> Tensor:
-        """Give each sequence's score, `(N,)`: the sum over its steps, of the effective sample size the mean."""
+        """Return each sequence's score, `(N,)`: the sum over its steps, of the effective sample size the mean."""
         total = self.values[metric].sum(1)
         return total / self.steps if metric == "ess" else total
 
@@ -180,7 +180,7 @@ class Parts:
         self.folder = folder / hashlib.sha256(repr(key).encode()).hexdigest()[:16]
 
     def read(self, first: int) -> Increments | None:
-        """Give the scores of the batch that begins with this sequence, None if it was not finished."""
+        """Return the scores of the batch that begins with this sequence, None if it was not finished."""
         path = self._path(first)
         if not path.exists():
             return None

@@ -38,13 +38,13 @@ class LinearGaussian(NamedTuple):
     """P_1, above 0."""
 
     def noise(self) -> Tensor:
-        """Give the variance that each step adds: P_1, Q, ..., Q, `(T,)`."""
+        """Return the variance that each step adds: P_1, Q, ..., Q, `(T,)`."""
         noise = torch.full((self.steps,), self.process_noise, dtype=torch.float64)
         noise[0] = self.first_variance
         return noise
 
     def precision(self) -> Tensor:
-        """Give the inverse covariance of all of (s, o), `(2 T, 2 T)`."""
+        """Return the inverse covariance of all of (s, o), `(2 T, 2 T)`."""
         eye = torch.eye(self.steps, dtype=torch.float64)
         step = eye - self.transition * _shift(self.steps)  # step @ s is the process noise
         states = step.T @ torch.diag(1 / self.noise()) @ step  # (T, T)
@@ -52,7 +52,7 @@ class LinearGaussian(NamedTuple):
         return torch.cat((torch.cat((states + seen, -seen), 1), torch.cat((-seen, seen), 1)))  # (2 T, 2 T)
 
     def moment(self) -> Tensor:
-        """Give E[o o'] over the process, which is the covariance of o_1:T, `(T, T)`."""
+        """Return E[o o'] over the process, which is the covariance of o_1:T, `(T, T)`."""
         eye = torch.eye(self.steps, dtype=torch.float64)
         step = eye - self.transition * _shift(self.steps)
         paths: Tensor = torch.linalg.solve_triangular(step, eye, upper=False)  # s = paths @ noise
@@ -75,7 +75,7 @@ class Conditional(NamedTuple):
         return Conditional(torch.zeros_like(self.carry), mean, spread.square().sum(1))
 
     def joint_moment(self, moment: Tensor) -> Tensor:
-        """Give the second moment of (s, o) under q(s | o) and that of o, `(T, T)` to `(2 T, 2 T)`."""
+        """Return the second moment of (s, o) under q(s | o) and that of o, `(T, T)` to `(2 T, 2 T)`."""
         mean, spread = self._paths()
         cross = mean @ moment
         states = cross @ mean.T + spread @ spread.T
@@ -91,7 +91,7 @@ class Conditional(NamedTuple):
 
 
 def _shift(steps: int) -> Tensor:
-    """Give the matrix that takes s_t to its predecessor s_{t-1}, `(T, T)`."""
+    """Return the matrix that takes s_t to its predecessor s_{t-1}, `(T, T)`."""
     return torch.diag(torch.ones(steps - 1, dtype=torch.float64), -1)
 
 
@@ -125,7 +125,7 @@ def expected_kl(posterior: Conditional, target: Conditional, moment: Tensor) -> 
 
 
 def exact_filter(process: LinearGaussian) -> Conditional:
-    """Give the exact belief p(s_t | o_1:t), the Kalman filter's; as a posterior it is independent over t."""
+    """Return the exact belief p(s_t | o_1:t), the Kalman filter's; as a posterior it is independent over t."""
     gains, variances = [], []
     gain = torch.zeros(process.steps, dtype=torch.float64)
     variance = torch.tensor(0.0, dtype=torch.float64)
@@ -141,18 +141,18 @@ def exact_filter(process: LinearGaussian) -> Conditional:
 
 
 def exact_one_step(process: LinearGaussian) -> Conditional:
-    """Give p(s_t | s_{t-1}, o_t), exact but for what later observations say."""
+    """Return p(s_t | s_{t-1}, o_t), exact but for what later observations say."""
     zero = torch.zeros(process.steps, process.steps, dtype=torch.float64)
     return _with_future(process, zero[0], zero)
 
 
 def smoothing(process: LinearGaussian) -> Conditional:
-    """Give p(s_t | s_{t-1}, o_t:T), the true conditionals of the posterior p(s | o)."""
+    """Return p(s_t | s_{t-1}, o_t:T), the true conditionals of the posterior p(s | o)."""
     return _with_future(process, *_future(process))
 
 
 def structured_optimum(process: LinearGaussian) -> Conditional:
-    """Give the q(s_t | s_{t-1}, o_1:t) of the highest ELBO.
+    """Return the q(s_t | s_{t-1}, o_1:t) of the highest ELBO.
 
     It is `smoothing` with E[o_u | o_1:t] for each later o_u: its variance is as small as if the future were known, its
     mean does not know it, so it is over-confident. By the identity q_t is to minimise KL(q_t || p_t) averaged over the
@@ -167,7 +167,7 @@ def structured_optimum(process: LinearGaussian) -> Conditional:
 
 
 def _future(process: LinearGaussian) -> tuple[Tensor, Tensor]:
-    r"""Give J, `(T,)`, and H, `(T, T)`, what the future says of s_t.
+    r"""Return J, `(T,)`, and H, `(T, T)`, what the future says of s_t.
 
     .. math:: p(o_{t+1:T} \mid s_t) \propto \exp(-J_t s_t^2 / 2 + s_t \sum_u H_{tu} o_u)
 
@@ -196,7 +196,7 @@ def _with_future(process: LinearGaussian, precision: Tensor, information: Tensor
 
 
 def factorised_optimum(process: LinearGaussian) -> Conditional:
-    r"""Give the q(s_t | o_1:t), independent over t, of the highest ELBO.
+    r"""Return the q(s_t | o_1:t), independent over t, of the highest ELBO.
 
     With L the precision of s given o, its variance is :math:`1 / L_{tt}`, that of s_t given both neighbours. Its mean
     solves :math:`L_{tt} m_t = F/Q\,(m_{t-1} + E[m_{t+1} \mid o_{1:t}]) + o_t/R`. With the filter's mean :math:`\mu_t`
@@ -270,7 +270,7 @@ def belief_scores(process: LinearGaussian, posterior: Conditional) -> BeliefScor
 
 
 def _predictive(process: LinearGaussian, belief: Conditional) -> Conditional:
-    """Give the belief's densities of the next observation, p(o_t | belief at t - 1)."""
+    """Return the belief's densities of the next observation, p(o_t | belief at t - 1)."""
     before = _shift(process.steps)
     spread = process.transition**2 * before @ belief.variance + process.noise() + process.observation_noise  # (T,)
     return Conditional(belief.carry, process.transition * before @ belief.gain, spread)

@@ -16,7 +16,7 @@ __all__ = ["binomial_interval", "ecdf_band", "kolmogorov_smirnov", "pearson", "s
 
 
 def pearson(ranks: Tensor, samples: int, bins: int = 10) -> Tensor:
-    r"""Give the p-value of Pearson's :math:`\chi^2` test over nearly equal bins.
+    r"""Return the p-value of Pearson's :math:`\chi^2` test over nearly equal bins.
 
     .. math:: \chi^2 = \sum_b (n_b - N p_b)^2 / (N p_b), \qquad p_b = \text{ranks in bin } b \,/\, (L + 1)
 
@@ -49,7 +49,7 @@ def spread(ranks: Tensor, samples: int, generator: torch.Generator) -> Tensor:
 
 
 def kolmogorov_smirnov(values: Tensor) -> Tensor:
-    r"""Give the p-value of Kolmogorov and Smirnov's test against U(0, 1); for ranks, of their `spread`.
+    r"""Return the p-value of Kolmogorov and Smirnov's test against U(0, 1); for ranks, of their `spread`.
 
     .. math:: D = \sup_x |\hat F(x) - x|, \qquad p = 2 \sum_k (-1)^{k-1} e^{-2 k^2 x^2},
               \qquad x = D\sqrt N + \frac{1}{6\sqrt N} + \frac{D\sqrt N - 1}{4N}
@@ -74,7 +74,7 @@ def kolmogorov_smirnov(values: Tensor) -> Tensor:
 
 
 def binomial_interval(count: int, probability: Tensor, confidence: float) -> tuple[Tensor, Tensor]:
-    """Give the central interval of a binomial share: at most (1 - confidence) / 2 lies beyond each end.
+    """Return the central interval of a binomial share: at most (1 - confidence) / 2 lies beyond each end.
 
     Args:
         count: N, of trials.
@@ -92,7 +92,7 @@ def binomial_interval(count: int, probability: Tensor, confidence: float) -> tup
 
 
 def _binomial_cdf(count: int, probability: Tensor) -> Tensor:
-    """Give P(at most k successes) for k = 0 … N, `(A,)` to `(A, N + 1)`."""
+    """Return P(at most k successes) for k = 0 … N, `(A,)` to `(A, N + 1)`."""
     k = torch.arange(count + 1, dtype=torch.float64)
     p = probability.double()[:, None]
     ways = math.lgamma(count + 1) - torch.lgamma(k + 1) - torch.lgamma(count - k + 1)
@@ -103,7 +103,7 @@ def _binomial_cdf(count: int, probability: Tensor) -> Tensor:
 def ecdf_band(
     count: int, samples: int, confidence: float, generator: torch.Generator, simulations: int = 2000
 ) -> tuple[Tensor, Tensor]:
-    """Give a band that holds the whole distribution function of N uniform ranks (Säilynoja et al., 2022).
+    """Return a band that holds the whole distribution function of N uniform ranks (Säilynoja et al., 2022).
 
     At each rank it is a binomial interval; their common confidence is found by simulation.
 

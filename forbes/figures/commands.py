@@ -59,7 +59,7 @@ def _strokes(args: argparse.Namespace) -> None:
 
 
 def _agents(runs: Sequence[str]) -> tuple[str, dict[str, list[pd.Series]]]:
-    """Give the task of agents, and by name the curves of their returns, one for each seed."""
+    """Return the task of agents, and by name the curves of their returns, one for each seed."""
     curves: dict[str, list[pd.Series]] = {}
     tasks = set()
     for run in runs:
@@ -101,7 +101,7 @@ def group(runs: Sequence[TrainedRun]) -> list[Family]:
 
 
 def _curve(run: TrainedRun) -> pd.Series:
-    """Give the bound of the validation split against updates."""
+    """Return the bound of the validation split against updates."""
     metrics = read_metrics(run.path)
     name = f"val/{run.model.bound_name}"
     if name not in metrics:

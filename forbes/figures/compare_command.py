@@ -166,6 +166,6 @@ def _write(comparison: Comparison, families: Sequence[Family], folder: Path, com
 
 
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Give the rows, empty numbers as null: JSON has no NaN."""
+    """Return the rows, empty numbers as null: JSON has no NaN."""
     rows: list[dict[str, Any]] = table.astype(object).where(table.notna(), None).to_dict("records")
     return rows

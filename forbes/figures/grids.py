@@ -118,7 +118,7 @@ def _is_labelled(panel: Panel | Bars) -> bool:
 
 
 def _first(band: Sequence[Panel | Bars]) -> Panel:
-    """Give the first panel of a band, which has frames."""
+    """Return the first panel of a band, which has frames."""
     assert isinstance(band[0], Panel)
     return band[0]
 

@@ -67,7 +67,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def density_map(colour: str) -> LinearSegmentedColormap:
-    """Give a colour map from white to a colour."""
+    """Return a colour map from white to a colour."""
     return LinearSegmentedColormap.from_list("density", ["white", colour])
 
 

@@ -18,7 +18,7 @@ _SIDE = 256
 
 
 def gif(episodes: Sequence[NDArray[np.uint8]]) -> bytes:
-    """Give the content of a GIF of episodes, one after the other, at 25 frames a second, for ever.
+    """Return the content of a GIF of episodes, one after the other, at 25 frames a second, for ever.
 
     A frame has a palette of its own, of 256 colours. A frame like the one before it is not stored but shown for longer.
 

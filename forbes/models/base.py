@@ -117,7 +117,7 @@ class BeliefModel(Configurable, nn.Module, ABC):
 
     @abstractmethod
     def initial(self, batch: int) -> State:
-        """Give (h_0, s_0), `(B, ...)`: what is carried before anything was seen."""
+        """Return (h_0, s_0), `(B, ...)`: what is carried before anything was seen."""
 
     @abstractmethod
     def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
@@ -151,7 +151,7 @@ class BeliefModel(Configurable, nn.Module, ABC):
         """
 
     def draws(self, number: int) -> int:
-        """Give how many independent draws of the belief make so many particles."""
+        """Return how many independent draws of the belief make so many particles."""
         return number
 
     def see(self, observation: Tensor, action: Tensor) -> Seen:
@@ -170,14 +170,14 @@ class BeliefModel(Configurable, nn.Module, ABC):
         return embedding.view(*target.shape[:2], -1)  # (B, T, E)
 
     def decode(self, features: Tensor) -> Tensor:
-        """Give the likelihood's parameters: features `(*, F)` to `(*, *O)`."""
+        """Return the likelihood's parameters: features `(*, F)` to `(*, *O)`."""
         output: Tensor = self.decoder(features.flatten(0, -2))  # (N, *O)
         if self.center is not None:
             output = output + self.center
         return output.view(*features.shape[:-1], *output.shape[1:])  # (*, *O)
 
     def log_likelihood(self, features: Tensor, target: Tensor) -> Tensor:
-        """Give log p(o | features) in nats: `(*, F)` and `(*, *O)`, which broadcast, to `(*)`."""
+        """Return log p(o | features) in nats: `(*, F)` and `(*, *O)`, which broadcast, to `(*)`."""
         return self.likelihood.log_prob(self.decode(features).float(), target)
 
 

@@ -22,13 +22,13 @@ class Densities(Protocol):
     """What the bound asks of a process: three densities, in nats, differentiable in the state."""
 
     def log_initial(self, state: Tensor) -> Tensor:
-        """Give log p(s_1): `(*, D)` to `(*)`."""
+        """Return log p(s_1): `(*, D)` to `(*)`."""
 
     def log_transition(self, next_state: Tensor, state: Tensor, action: Tensor) -> Tensor:
-        """Give log p(s_t | s_{t-1}, a_{t-1}): `(*, D)`, `(*, D)` and `(*, A)`, which broadcast, to `(*)`."""
+        """Return log p(s_t | s_{t-1}, a_{t-1}): `(*, D)`, `(*, D)` and `(*, A)`, which broadcast, to `(*)`."""
 
     def log_observation(self, observation: Tensor, state: Tensor) -> Tensor:
-        """Give log p(o_t | s_t): `(*, O)` and `(*, D)`, which broadcast, to `(*)`."""
+        """Return log p(o_t | s_t): `(*, O)` and `(*, D)`, which broadcast, to `(*)`."""
 
 
 class Units(nn.Module):
@@ -48,15 +48,15 @@ class Units(nn.Module):
         self.register_buffer("std", examples.std(0).float())
 
     def forward(self, x: Tensor) -> Tensor:
-        """Give z of x, `(*, D)`."""
+        """Return z of x, `(*, D)`."""
         return (x - self.mean) / self.std
 
     def inverse(self, z: Tensor) -> Tensor:
-        """Give x of z, `(*, D)`."""
+        """Return x of z, `(*, D)`."""
         return torch.addcmul(self.mean, z, self.std)
 
     def log_det(self) -> Tensor:
-        """Give log|det ∂x/∂z| in nats, a scalar."""
+        """Return log|det ∂x/∂z| in nats, a scalar."""
         return self.std.log().sum()
 
 
@@ -87,7 +87,7 @@ class LearnedBelief:
             return self.rsample(count)[0]
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Give log q(s_t) in nats: `(..., B, T, D)` to `(..., B, T)`."""
+        """Return log q(s_t) in nats: `(..., B, T, D)` to `(..., B, T)`."""
         return self.head.log_prob(self.units(value), self.context) - self.units.log_det()
 
 

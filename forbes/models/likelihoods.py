@@ -30,10 +30,10 @@ class Likelihood(ABC):
 
     @abstractmethod
     def mean(self, output: Tensor) -> Tensor:
-        """Give E[o | output], for pictures as a grey value in [0, 1]; shape of `output`."""
+        """Return E[o | output], for pictures as a grey value in [0, 1]; shape of `output`."""
 
     def picture(self, observation: Tensor) -> Tensor:
-        """Give a stored observation in the units of `mean`."""
+        """Return a stored observation in the units of `mean`."""
         return self.target(observation)
 
     @abstractmethod
@@ -42,7 +42,7 @@ class Likelihood(ABC):
 
     @abstractmethod
     def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
-        """Give log p(target | output) in nats: whole images `(*, C, H, W)`, or vectors `(*, O)`, to `(*)`."""
+        """Return log p(target | output) in nats: whole images `(*, C, H, W)`, or vectors `(*, O)`, to `(*)`."""
 
 
 class Bernoulli(Likelihood):
@@ -261,7 +261,7 @@ class OneHot(Likelihood):
 
 @fused
 def _normal(mean: Tensor, value: Tensor, std: float, dims: tuple[int, ...]) -> Tensor:
-    """Give log N(value; mean, std²) in nats, summed over the last dimensions."""
+    """Return log N(value; mean, std²) in nats, summed over the last dimensions."""
     constant = math.log(std) + 0.5 * math.log(2 * math.pi)
     error = ((value - mean) / std).square().sum(dims)
     return -0.5 * error - constant * math.prod(value.shape[-len(dims) :])

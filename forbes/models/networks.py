@@ -53,7 +53,7 @@ class Perceptron(nn.Sequential):
 
 
 def activate(module: nn.Module, activation: Activation) -> None:
-    """Give every perceptron of a module another activation."""
+    """Replace the activation of every perceptron of a module."""
     for part in module.modules():
         if isinstance(part, Perceptron):
             for block in part.children():
@@ -73,7 +73,7 @@ def bind_gru(cell: nn.GRUCell, loop: Loop) -> Callable[[Tensor, Tensor], Tensor]
 
 @fused
 def _gate(of_hidden: Tensor, of_x: Tensor, hidden: Tensor) -> Tensor:
-    """Give the next h of a GRU, `(B, H)`, from the shares of h and x, `(B, 3 H)`."""
+    """Return the next h of a GRU, `(B, H)`, from the shares of h and x, `(B, 3 H)`."""
     sizes = [2 * hidden.shape[-1], hidden.shape[-1]]
     gates_x, new_x = of_x.split(sizes, -1)  # (B, 2 H), (B, H)
     gates_h, new_h = of_hidden.split(sizes, -1)  # (B, 2 H), (B, H)

@@ -59,7 +59,7 @@ class Particles(NamedTuple):
 
 
 def effective_sample_size(log_weight: Tensor) -> Tensor:
-    """Give 1 / Σ_k W_k² of normalised log-weights: `(K, B)` to `(B,)`, between 1 and K."""
+    """Return 1 / Σ_k W_k² of normalised log-weights: `(K, B)` to `(B,)`, between 1 and K."""
     return torch.exp(-torch.logsumexp(2 * log_weight, 0))
 
 

@@ -48,7 +48,7 @@ class Filtered(NamedTuple):
         return torch.cat((self.hidden, self.state), -1)  # (B, T, H + D)
 
     def at(self, time: int) -> State:
-        """Give the state at one step, to go on from."""
+        """Return the state at one step, to go on from."""
         return State(self.hidden[:, time], self.state[:, time])  # (B, H), (B, D)
 
 
@@ -104,7 +104,7 @@ class StateSpaceModel(BeliefModel):
         return f"elbo[{self.likelihood.name},S=1]"
 
     def initial(self, batch: int) -> State:
-        """Give (h_0, s_0) = 0."""
+        """Return (h_0, s_0) = 0."""
         weight = self.gru.weight_hh
         return State(weight.new_zeros(batch, self.hidden_dim), weight.new_zeros(batch, self.state_dim))
 
@@ -156,7 +156,7 @@ class StateSpaceModel(BeliefModel):
         return Filtered(*(torch.stack(values, 1) for values in zip(*steps, strict=True)))  # (B, T, ...)
 
     def prior_log_prob(self, filtered: Filtered) -> Tensor:
-        """Give log p(s_t | h_t) of the posterior's samples in nats, `(B, T)`."""
+        """Return log p(s_t | h_t) of the posterior's samples in nats, `(B, T)`."""
         with full_precision(filtered.state):
             return self.prior.log_prob(filtered.state, self.prior_context(filtered.hidden))
 
@@ -192,7 +192,7 @@ class StateSpaceModel(BeliefModel):
         return self.filter(seen.embedding.repeat(samples, 1, 1), seen.action.repeat(samples, 1, 1)).at(-1)  # (N B, ...)
 
     def predict(self, filtered: Filtered) -> Tensor:
-        """Give [h_t, s_t] with s_t drawn from the prior, which has not seen o_t, `(B, T, H + D)`."""
+        """Return [h_t, s_t] with s_t drawn from the prior, which has not seen o_t, `(B, T, H + D)`."""
         state, _ = self.prior.rsample(self.prior_context(filtered.hidden))  # (B, T, D)
         return torch.cat((filtered.hidden, state), -1)  # (B, T, H + D)
 

@@ -86,7 +86,7 @@ class VectorModel(BeliefModel):
         return f"log_p[{self.likelihood.name}]"
 
     def initial(self, batch: int) -> State:
-        """Give h_0 = 0, with nothing seen."""
+        """Return h_0 = 0, with nothing seen."""
         return State(self.nothing.new_zeros(batch, self.hidden_dim), self.nothing.expand(batch, -1))
 
     def filter(self, embedding: Tensor, action: Tensor, start: State | None = None) -> Tensor:
@@ -125,7 +125,7 @@ class VectorModel(BeliefModel):
         return 1
 
     def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
-        """Give log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the roll-out beside them."""
+        """Return log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the roll-out beside them."""
         seen = self.see(observation, action)
         hidden = self.filter(seen.embedding, action)
         log_likelihood = self.log_likelihood(hidden, seen.target)  # (B, T)
@@ -133,7 +133,7 @@ class VectorModel(BeliefModel):
         return ElboTerms(log_likelihood, torch.zeros_like(log_likelihood), None, mask, auxiliary)
 
     def _run(self, hidden: Tensor, embedding: Tensor, action: Tensor) -> Tensor:
-        """Give h after each (e, a), `(B, T, H)`: all inputs are known, so the loop holds the GRU only."""
+        """Return h after each (e, a), `(B, T, H)`: all inputs are known, so the loop holds the GRU only."""
         steps: list[Tensor] = []
         with full_precision(embedding):
             moves = self.transition(torch.cat((embedding, action), -1))  # (B, T, M)
@@ -144,7 +144,7 @@ class VectorModel(BeliefModel):
         return torch.stack(steps, 1)  # (B, T, H)
 
     def _overshoot(self, hidden: Tensor, seen: Seen, mask: Tensor) -> Tensor:
-        r"""Give the loss of one roll-out in each sequence, from a step u among its own, in nats per step.
+        r"""Return the loss of one roll-out in each sequence, from a step u among its own, in nats per step.
 
         .. math:: -\frac1L \sum_{j=1}^{L} \log p(o_{u+j} \mid h_u, a_{u:u+j-1}), \qquad u \sim U\{1, \dots, T - 1\}
 

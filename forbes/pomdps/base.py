@@ -64,7 +64,7 @@ class AffineGaussian(NamedTuple):
     """C_t, `(T, D, D)`."""
 
     def at(self, time: int, previous: Tensor) -> GaussianMixtureBelief:
-        """Give the Gaussian of s_t at index `time` (from 0), given s_{t-1} of shape `(..., B, D)`."""
+        """Return the Gaussian of s_t at index `time` (from 0), given s_{t-1} of shape `(..., B, D)`."""
         mean = previous @ self.gain[time].T + self.offset[:, time]  # (..., B, D)
         return GaussianMixtureBelief(mean.new_zeros(*mean.shape[:-1], 1), mean.unsqueeze(-2), self.covariance[time])
 
@@ -90,15 +90,15 @@ class Process(Named, ABC):
 
     @abstractmethod
     def initial(self, like: Tensor) -> Distribution:
-        """Give p(s_1), in the dtype and on the device of `like`."""
+        """Return p(s_1), in the dtype and on the device of `like`."""
 
     @abstractmethod
     def transition(self, state: Tensor, action: Tensor) -> Distribution:
-        """Give p(s_t | s_{t-1}, a_{t-1}) for `(*, D)` and `(*, A)`, which broadcast."""
+        """Return p(s_t | s_{t-1}, a_{t-1}) for `(*, D)` and `(*, A)`, which broadcast."""
 
     @abstractmethod
     def emission(self, state: Tensor) -> Distribution:
-        """Give p(o_t | s_t) for `(*, D)`."""
+        """Return p(o_t | s_t) for `(*, D)`."""
 
     @abstractmethod
     def policy(self, sequences: int, steps: int, generator: torch.Generator) -> Tensor:
@@ -124,7 +124,7 @@ class Process(Named, ABC):
         return None
 
     def reward(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        """Give r(s_{t-1}, a_{t-1}, s_t) for `(*, D)`, `(*, A)` and `(*, D)`, `(*)`; it is never seen by the filter.
+        """Return r(s_{t-1}, a_{t-1}, s_t) for `(*, D)`, `(*, A)` and `(*, D)`, `(*)`; it is never seen by the filter.
 
         Raises:
             ForbesError: where the process has no rewards.
@@ -137,19 +137,19 @@ class Process(Named, ABC):
         return torch.zeros(state.shape[:-1], dtype=torch.bool, device=state.device)
 
     def log_likelihood(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Give log p(o_1:T | a_1:T-1) in nats, `(B,)`."""
+        """Return log p(o_1:T | a_1:T-1) in nats, `(B,)`."""
         return self.exact_filter(observation, action).log_likelihood
 
     def log_initial(self, state: Tensor) -> Tensor:
-        """Give log p(s_1) in nats: `(*, D)` to `(*)`."""
+        """Return log p(s_1) in nats: `(*, D)` to `(*)`."""
         return self.initial(state).log_prob(state)
 
     def log_transition(self, next_state: Tensor, state: Tensor, action: Tensor) -> Tensor:
-        """Give log p(s_t | s_{t-1}, a_{t-1}) in nats: `(*, D)`, `(*, D)` and `(*, A)`, which broadcast, to `(*)`."""
+        """Return log p(s_t | s_{t-1}, a_{t-1}) in nats: `(*, D)`, `(*, D)` and `(*, A)`, which broadcast, to `(*)`."""
         return self.transition(state, action).log_prob(next_state)
 
     def log_observation(self, observation: Tensor, state: Tensor) -> Tensor:
-        """Give log p(o_t | s_t) in nats: `(*, O)` and `(*, D)`, which broadcast, to `(*)`."""
+        """Return log p(o_t | s_t) in nats: `(*, O)` and `(*, D)`, which broadcast, to `(*)`."""
         return self.emission(state).log_prob(observation)
 
     def sample(self, sequences: int, length: int, generator: torch.Generator) -> Trajectories:
@@ -171,7 +171,7 @@ class Process(Named, ABC):
         return Trajectories(path, self.emission(path).sample(1, generator).squeeze(0), action)
 
     def checked(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Give both in float64 on the CPU, or say in one sentence what is wrong with them."""
+        """Return both in float64 on the CPU, or say in one sentence what is wrong with them."""
         where = type(self).__name__
         _require_sequences(f"{where}: the observation", observation, self.observation_dim)
         _require_sequences(f"{where}: the action", action, self.action_dim)

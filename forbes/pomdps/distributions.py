@@ -14,7 +14,7 @@ class Distribution(ABC):
 
     @abstractmethod
     def log_prob(self, value: Tensor) -> Tensor:
-        """Give the log-density in nats: `(..., *, D)` to `(..., *)`, which broadcast."""
+        """Return the log-density in nats: `(..., *, D)` to `(..., *)`, which broadcast."""
 
     @abstractmethod
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
@@ -54,7 +54,7 @@ class PointMass(Distribution):
         self.point = point
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Give log P: 0 where the value is the very point, else -inf."""
+        """Return log P: 0 where the value is the very point, else -inf."""
         return torch.where((value == self.point).all(-1), 0.0, -torch.inf).to(self.point)
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:

@@ -113,7 +113,7 @@ def smoothing_conditional(system: LinearSystem, observation: Tensor, drive: Tens
 
 
 def _log_normal(deviation: Tensor, covariance: Tensor) -> Tensor:
-    """Give log N(deviation; 0, covariance) in nats: `(*, O)` and `(O, O)` to `(*)`."""
+    """Return log N(deviation; 0, covariance) in nats: `(*, O)` and `(O, O)` to `(*)`."""
     scale: Tensor = torch.linalg.cholesky(covariance)
     noise: Tensor = torch.linalg.solve_triangular(scale, deviation.mT, upper=False).mT  # (*, O)
     standard = DiagonalGaussian(torch.zeros_like(noise), 1.0).log_prob(noise)

@@ -83,7 +83,7 @@ class LinearGaussian(Process):
         return smoothing_conditional(self.system(), observation, torch.zeros_like(observation))
 
     def system(self) -> LinearSystem:
-        """Give the matrices, which any other linear-Gaussian formula may use."""
+        """Return the matrices, which any other linear-Gaussian formula may use."""
         one = torch.ones(1, 1, dtype=torch.float64)
         return LinearSystem(
             transition=self.coefficient * one,

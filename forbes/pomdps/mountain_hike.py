@@ -121,7 +121,7 @@ class MountainHike(Process):
         return smoothing_conditional(self.system(), observation, step_of(action))
 
     def system(self) -> LinearSystem:
-        """Give the matrices, which any other linear-Gaussian formula may use."""
+        """Return the matrices, which any other linear-Gaussian formula may use."""
         unit = torch.eye(2, dtype=torch.float64)
         return LinearSystem(
             transition=unit,
@@ -134,6 +134,6 @@ class MountainHike(Process):
 
 
 def step_of(action: Tensor) -> Tensor:
-    """Give c(a), the action cut to the length of a step, `(*, 2)`."""
+    """Return c(a), the action cut to the length of a step, `(*, 2)`."""
     length: Tensor = torch.linalg.vector_norm(action, dim=-1, keepdim=True)
     return action * (MAX_STEP / length.clamp(min=MAX_STEP))

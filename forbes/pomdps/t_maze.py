@@ -76,7 +76,7 @@ class TMaze(FiniteProcess):
 
 
 def next_place(length: int, action: int) -> Tensor:
-    """Give the place that an action leads to from each of the L + 3, int64."""
+    """Return the place that an action leads to from each of the L + 3, int64."""
     place = torch.arange(length + 3)
     after = place.clone()
     if action == RIGHT:

@@ -84,7 +84,7 @@ class ActingModel(WorldModel, ABC):
 
     @abstractmethod
     def choose(self, exploring: bool) -> Choice:
-        """Give how to act: with exploration, to learn from it, or as well as the agent can."""
+        """Return how to act: with exploration, to learn from it, or as well as the agent can."""
 
     def objectives(self, batch: SequenceBatch) -> list[Objective]:
         """See `WorldModel.objectives`: that of the world model."""
@@ -97,14 +97,14 @@ class ActingModel(WorldModel, ABC):
         return seen, self.model.filter(seen.embedding, seen.action)
 
     def model_objective(self, filtered: Filtered, seen: Seen, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Give the loss of model and reward in nats per step, and what is logged of it, along a trajectory."""
+        """Return the loss of model and reward in nats per step, and what is logged of it, along a trajectory."""
         terms = self.model.bound(filtered, seen, batch.mask, self.kl)
         means = {name: terms.mean_over_steps(values) for name, values in self.log_probs(filtered, batch).items()}
         loss = self.loss(terms) - sum(means.values())
         return loss, self.measures(terms) | {name: mean.detach() for name, mean in means.items()}
 
     def log_probs(self, filtered: Filtered, batch: SequenceBatch) -> dict[str, Tensor]:
-        """Give what the model learns besides observations, by name: log p(r_t | f_t) in nats, `(B, T)`."""
+        """Return what the model learns besides observations, by name: log p(r_t | f_t) in nats, `(B, T)`."""
         error: Tensor = (self.reward(filtered.features) - batch.reward) / self.reward_std  # (B, T)
         return {"reward": -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))}
 

@@ -162,11 +162,11 @@ class ImaginationActorCritic(ActingModel):
         return actor_loss(returns, discount, valid), critic
 
     def _world(self) -> list[nn.Module]:
-        """Give what the model's loss trains."""
+        """Return what the model's loss trains."""
         return [part for part in (self.model, self.reward, self.continues) if part is not None]
 
     def _discount(self, features: Tensor) -> Tensor:
-        """Give the discounts of imagined trajectories, `(*, H, F)` to `(*, H)` or, all alike, `(H,)`."""
+        """Return the discounts of imagined trajectories, `(*, H, F)` to `(*, H)` or, all alike, `(H,)`."""
         if self.continues is None:
             return features.new_full(features.shape[-2:-1], self.discount)  # (H,)
         goes_on: Tensor = self.continues(features).sigmoid()  # (*, H)

@@ -252,7 +252,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def _name_too(path: Path, name: str) -> None:
-    """Give a file another name in its folder, in the place of the file that has it; a copy where links are unknown."""
+    """Name a file a second time in its folder, in place of the file with that name; copy it where links are unknown."""
     aside = path.with_name(f".{name}.part")
     aside.unlink(missing_ok=True)
     try:

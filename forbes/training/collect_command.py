@@ -49,7 +49,7 @@ def collect(output: Path, episodes: int, policy: str, seed: int, **environment: 
 
 @contextmanager
 def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, MakePolicy]]:
-    """Give who acts, and where: an agent in the environment of its run."""
+    """Return who acts, and where: an agent in the environment of its run."""
     if policy != _RANDOM:
         if given:
             flag = "--" + min(given).replace("_", "-")

@@ -293,5 +293,5 @@ def _print_predictions(found: Sequence[Tensor]) -> None:
 
 
 def _as_list(value: Any) -> list[Any]:
-    """Give what a configuration holds as one thing, several, or none."""
+    """Return what a configuration holds as one thing, several, or none."""
     return [] if value is None else list(value) if isinstance(value, list) else [value]

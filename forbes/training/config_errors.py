@@ -88,7 +88,7 @@ def _nearest_of_all(option: str) -> str:
 
 
 def _arguments(kind: type) -> set[str]:
-    """Give the arguments of a class and of all of ours that derive from it."""
+    """Return the arguments of a class and of all of ours that derive from it."""
     ours = [each for each in _derived([kind]) if each is kind or each.__module__.startswith("forbes.")]
     return {name for each in ours for name in inspect.signature(each).parameters}
 
@@ -99,13 +99,13 @@ def _unknown_class(name: str) -> str:
 
 
 def _class_names() -> set[str]:
-    """Give the names of the classes a configuration may name."""
+    """Return the names of the classes a configuration may name."""
     found = _derived(CONFIGURABLE)
     return {kind.__name__ for kind in found if kind.__module__.split(".")[0] != "torch" and kind.__name__[0] != "_"}
 
 
 def _derived(kinds: Sequence[type]) -> set[type]:
-    """Give classes with all that derive from them."""
+    """Return classes with all that derive from them."""
     found: set[type] = set()
     pending = list(kinds)
     while pending:

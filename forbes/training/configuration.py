@@ -71,7 +71,7 @@ def allow_modules(names: Sequence[str] = ()) -> None:
 
 
 def allowed_modules() -> list[str]:
-    """Give the flags that let another process name the classes of the same modules."""
+    """Return the flags that let another process name the classes of the same modules."""
     return [part for name in _allowed for part in ("--allow-module", name)]
 
 
@@ -128,7 +128,7 @@ def add_seed(parser: LightningArgumentParser) -> None:
 
 
 def add_links(parser: LightningArgumentParser) -> None:
-    """Give the data's shapes, and whether its actions are discrete, to the model that asks, and the seed to both."""
+    """Link the data's shapes, and whether its actions are discrete, to the model's arguments, and the seed to both."""
     for name in ("observation_shape", "action_dim", "discrete"):
         parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
     for part in ("model", "data"):
@@ -153,7 +153,7 @@ def data_paths(data: Namespace) -> dict[str, str]:
 
 
 def experiment_parser() -> LightningArgumentParser:
-    """Give a parser of what makes a model and its data, without the trainer."""
+    """Return a parser of what makes a model and its data, without the trainer."""
     parser = LightningArgumentParser(exit_on_error=False)
     add_seed(parser)
     parser.add_lightning_class_args(LightningModule, "model", subclass_mode=True)

@@ -109,12 +109,12 @@ class KnownBelief(LightningModule):
             raise _not_its_data(self.process, f"those of {source.process}")
 
     def state_nll(self, batch: SequenceBatch) -> Tensor:
-        """Give -log q(s_t | o_1:t) of the true states in nats, `(B, T)`."""
+        """Return -log q(s_t | o_1:t) of the true states in nats, `(B, T)`."""
         with full_precision(batch.state):
             return -self.model.belief(batch.observation, batch.action).log_prob(batch.state)
 
     def loss(self, batch: SequenceBatch) -> Tensor:
-        """Give the objective in nats per step, a scalar."""
+        """Return the objective in nats per step, a scalar."""
         if self.objective == "state_nll":
             return self.state_nll(batch).mean()
         with full_precision(batch.state):
@@ -125,7 +125,7 @@ class KnownBelief(LightningModule):
         torch.manual_seed(derive_seed(self.seed, "update", batches_before(self)))
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
-        """Give and log the loss of one update."""
+        """Return and log the loss of one update."""
         loss = self.loss(batch)
         self.log("train/loss", loss.detach(), batch_size=len(batch.mask))
         return loss
@@ -143,7 +143,7 @@ class KnownBelief(LightningModule):
         self._log("test", batch)
 
     def predict_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
-        """Give -log q(s_t | o_1:t) of the true states in nats, `(B, T)`."""
+        """Return -log q(s_t | o_1:t) of the true states in nats, `(B, T)`."""
         return self.state_nll(batch)
 
     def configure_optimizers(self) -> Any:
@@ -162,7 +162,7 @@ class KnownBelief(LightningModule):
         follow_rates(self, [self.learning_rate])
 
     def _rate(self, update: int) -> float:
-        """Give the learning rate of an update as a share of `learning_rate`."""
+        """Return the learning rate of an update as a share of `learning_rate`."""
         return 0.5 * (1 + math.cos(math.pi * min(1.0, update / self.trainer.estimated_stepping_batches)))
 
     def _log(self, split: str, batch: SequenceBatch) -> None:

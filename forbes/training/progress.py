@@ -23,7 +23,7 @@ class TerminalProgress(RichProgressBar):
     """Lightning's bar, showing the objectives."""
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
-        """Give what the bar shows at its right."""
+        """Return what the bar shows at its right."""
         return dict(_objectives(trainer, pl_module))
 
 
@@ -73,7 +73,7 @@ class PlainProgress(ProgressBar):
 
 
 def _objectives(trainer: Trainer, module: LightningModule) -> dict[str, str]:
-    """Give the newest bound, or loss in nats per step, of each split; what an agent has seen, earns and foresees."""
+    """Return the newest bound, or loss in nats per step, of each split; what an agent has seen, earns and foresees."""
     objective = getattr(module, "objective_name", "loss")  # a module of somebody else's may have none
     return {
         name: _shown(name, float(value))

@@ -100,7 +100,7 @@ def read_provenance(path: Path) -> list[dict[str, Any]]:
 
 
 def _describe(arguments: Sequence[str]) -> dict[str, Any]:
-    """Give what does not depend on the configuration."""
+    """Return what does not depend on the configuration."""
     return {
         "command": command_line(*arguments),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -125,7 +125,7 @@ def _versions() -> dict[str, str]:
 
 
 def _describe_data(trainer: Trainer) -> dict[str, Any]:
-    """Give the hash of the data."""
+    """Return the hash of the data."""
     return {"data_sha256": trainer.datamodule.source.sha256()}  # type: ignore[attr-defined]
 
 
@@ -135,7 +135,7 @@ def command_line(*arguments: str) -> str:
 
 
 def commit() -> str | None:
-    """Give the commit of the checkout this package runs from, +dirty with changed files; None where git knows none."""
+    """Return the commit of the checkout this runs from, +dirty with changed files; None where git knows none."""
     root = Path(forbes.__file__).parents[1]
     if not (root / ".git").exists():
         return None

@@ -203,13 +203,13 @@ class WorldModel(LightningModule):
             self.model.center.copy_(self.model.likelihood.target(batch.observation)[batch.mask].mean(0))  # (*O)
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
-        """Give the loss of one update, and log what `losses` gives besides."""
+        """Return the loss of one update, and log what `losses` gives besides."""
         loss, values = self.losses(batch)
         self._log("train", values, batch)
         return loss
 
     def losses(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Give the loss of one update, the sum of all objectives, and what is logged of it: by name, detached."""
+        """Return the loss of one update, the sum of all objectives, and what is logged of it: by name, detached."""
         return together([objective() for objective in self.objectives(batch)])
 
     def objectives(self, batch: SequenceBatch) -> list[Objective]:
@@ -221,7 +221,7 @@ class WorldModel(LightningModule):
         return [lambda: (self.loss(terms), self.measures(terms))]
 
     def loss(self, terms: ElboTerms) -> Tensor:
-        """Give the loss of this update in nats per step, a scalar."""
+        """Return the loss of this update in nats per step, a scalar."""
         weight = min(1.0, (self.global_step + 1) / self.kl_warmup) if self.kl_warmup else 1.0
         return elbo_loss(terms, self.free_nats, self.free_nats_per, weight)
 
@@ -238,7 +238,7 @@ class WorldModel(LightningModule):
         self._log("test", self.measures(self.terms(batch)), batch)
 
     def predict_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
-        """Give the bound of each sequence in nats, `(B,)`, with one sample."""
+        """Return the bound of each sequence in nats, `(B,)`, with one sample."""
         return self.terms(batch).elbo
 
     def groups(self) -> list[Group]:
@@ -257,7 +257,7 @@ class WorldModel(LightningModule):
         follow_rates(self, [group.rate for group in self.groups()])
 
     def _rate(self, update: int) -> float:
-        """Give the learning rate of an update as a share of `learning_rate`."""
+        """Return the learning rate of an update as a share of `learning_rate`."""
         rise = min(1.0, (update + 1) / self.warmup) if self.warmup else 1.0
         if self.schedule == "constant":
             return rise
@@ -274,7 +274,7 @@ class WorldModel(LightningModule):
             hold_unless_finite(optimizer, norm, self.global_step)
 
     def measures(self, terms: ElboTerms) -> dict[str, Tensor]:
-        """Give means in nats per sequence, auxiliary losses per step: the bound without free nats, and its parts."""
+        """Return means in nats per sequence, auxiliary losses per step: the bound without free nats, and its parts."""
         parts = {
             "reconstruction": (terms.reconstruction * terms.mask).sum(1).mean(),
             "kl": (terms.kl * terms.mask).sum(1).mean(),
@@ -292,7 +292,7 @@ class WorldModel(LightningModule):
 
 
 def together(found: Sequence[tuple[Tensor, dict[str, Tensor]]]) -> tuple[Tensor, dict[str, Tensor]]:
-    """Give the sum of the losses that objectives have found, and all that is logged of them."""
+    """Return the sum of the losses that objectives have found, and all that is logged of them."""
     (first, _), *others = found
     loss = sum((loss for loss, _ in others), first)
     return loss, {name: value for _, values in found for name, value in values.items()}

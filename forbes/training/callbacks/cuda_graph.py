@@ -57,7 +57,7 @@ class CudaGraph(Callback):
                 vars(module)["losses"] = Recording(module, batch, trainer.precision_plugin.forward_context)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Give the module its own losses back."""
+        """Restore the losses of the module itself."""
         vars(pl_module).pop("losses", None)
 
 
@@ -110,7 +110,7 @@ class Recording:
         here.wait_stream(aside)
 
     def _compute(self) -> tuple[Tensor, dict[str, Tensor], list[Tensor | None]]:
-        """Give the loss, what is logged of it, and each parameter's gradient, where it has one."""
+        """Return the loss, what is logged of it, and each parameter's gradient, where it has one."""
         with self.precision():
             objectives = self.module.objectives(self.batch)  # holds what branches share until all are done
         here = torch.cuda.current_stream()
@@ -156,7 +156,7 @@ class _Played(torch.autograd.Function):
 
 @cache
 def _streams(number: int) -> list[torch.cuda.Stream]:
-    """Give streams, the same ones for the gradients' kernels."""
+    """Return streams, the same ones for the gradients' kernels."""
     return [torch.cuda.Stream() for _ in range(number)]
 
 

@@ -101,7 +101,7 @@ def to_device(batch: SequenceBatch, module: LightningModule) -> SequenceBatch:
 
 
 def shown_sequences(data: SequenceDataModule, count: int, module: LightningModule) -> SequenceBatch:
-    """Give sequences that no model has a say in, where the module is.
+    """Return sequences that no model has a say in, where the module is.
 
     They are the first of each class of the validation split. An agent's experience has no such split: then they are the
     beginnings of the newest episodes, which it has learned from least, or not yet where `Collect` comes before.

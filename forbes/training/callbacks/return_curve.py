@@ -45,7 +45,7 @@ class ReturnCurve(PictureCallback):
         return return_curve(read_metrics(str(trainer.log_dir)), task, published)
 
     def _published(self, data: SequenceDataModule) -> tuple[str, dict[str, list[pd.Series]]]:
-        """Give the task, and what others have published of it."""
+        """Return the task, and what others have published of it."""
         source = data.source
         assert isinstance(source, Experience)
         return source.task, published_curves(self.reference, source.task)
