@@ -17,6 +17,7 @@ import torch
 from jsonargparse import Namespace
 from lightning import LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, SaveConfigCallback
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 import forbes
 from forbes.errors import ForbesError
@@ -74,7 +75,8 @@ class RecordRun(SaveConfigCallback):
         """Note failure, or the signal that has ended the training."""
         failed = exception.exit_status if isinstance(exception, ForbesError) else 1
         with suppress(ForbesError):  # on a full disk; why the training has failed is worth more than its record
-            self._end(failed if self.stop.received is None else self.stop.exit_status)
+            stopped = isinstance(exception, SIGTERMException) or self.stop.received is not None
+            self._end(self.stop.exit_status if stopped else failed)
 
     def _end(self, exit_status: int) -> None:
         if self.already_saved:

@@ -3,6 +3,7 @@
 import os
 import signal
 from types import FrameType
+from typing import Any, cast
 
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
@@ -31,8 +32,11 @@ class StopOnSignal(Callback):
 
     @property
     def exit_status(self) -> int:
-        """What a shell expects of a process that a signal has ended: 130 for Ctrl-C, 143 for SIGTERM."""
-        return 128 + (self.received or 0)
+        """What a shell expects of a process that a signal has ended: 130 for Ctrl-C, 143 for SIGTERM.
+
+        One that came before the training began was received by Lightning, which knows SIGTERM only.
+        """
+        return 128 + (self.received or signal.SIGTERM)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Take the place of Lightning's handler, which it puts back itself after the training."""
@@ -40,6 +44,9 @@ class StopOnSignal(Callback):
         self._whole_epochs = isinstance(trainer.datamodule.source, Experience)  # type: ignore[attr-defined]
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._receive)
+        if trainer.received_sigterm:  # since the start; Lightning would end the loop within an agent's epoch
+            cast(Any, trainer)._signal_connector.received_sigterm = False
+            self._receive(signal.SIGTERM, None)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         """End the loop after this update, unless a validation follows, which must not be left half done."""

@@ -19,7 +19,7 @@ from forbes.evaluation.foresight import foretell, share_explained
 from forbes.seeding import derive_seed
 from forbes.training import ImaginationActorCritic
 from forbes.training.acting import play_measured
-from forbes.training.checkpoint import read_checkpoint
+from forbes.training.checkpoint import ResumeWholeEpochs, read_checkpoint
 from forbes.training.loading import load_run
 from forbes.training.run_folder import RunFolder, read_metrics
 
@@ -401,6 +401,15 @@ def test_a_signal_ends_the_training_with_the_epoch_and_nothing_is_missing(
     pd.testing.assert_frame_equal(read_metrics(stopped), read_metrics(whole), check_exact=True)
     state, expected = (read_checkpoint(RunFolder(path).checkpoint)["state_dict"] for path in (stopped, whole))
     torch.testing.assert_close(state, expected, rtol=0, atol=0)
+
+
+def test_a_signal_before_the_training_begins_ends_it_with_an_epoch(tmp_path, monkeypatch):
+    """There Lightning's own handler receives it, which would end the loop within the epoch."""
+    monkeypatch.setattr(ResumeWholeEpochs, "on_train_start", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+
+    assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run") == 128 + signal.SIGTERM
+
+    assert read_checkpoint(RunFolder(tmp_path / "run").checkpoint)["global_step"] == 4
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -10,7 +10,8 @@ import torch
 
 from forbes.cli import main
 from forbes.training import WorldModel
-from forbes.training.checkpoint import read_checkpoint
+from forbes.training.checkpoint import ResumeWholeEpochs, read_checkpoint
+from forbes.training.provenance import read_provenance
 from forbes.training.run_folder import RunFolder, read_metrics
 
 FOUR_EPOCHS = ["--trainer.max_epochs", "4"]  # of five updates
@@ -149,6 +150,25 @@ def test_a_signal_stops_a_training_where_it_can_go_on(
     assert f"stopped at update {stops_at}, go on with: forbes fit --resume {run}" in capsys.readouterr().out
     assert main(["fit", "--resume", run]) == 0
     assert_same_run(run, straight)
+
+
+def terminate(*_: object) -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.parametrize(("hook", "stops_at"), [("on_sanity_check_start", 0), ("on_sanity_check_end", 1)])
+def test_a_signal_before_the_training_begins_stops_it_too(straight, tiny_config, tmp_path, monkeypatch, hook, stops_at):
+    """There Lightning's own handler receives it; the status was 128."""
+    run = RunFolder(tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(ResumeWholeEpochs, hook, terminate)
+        status = main(["fit", "--config", str(tiny_config), "--run_dir", str(run), *FOUR_EPOCHS])
+
+    assert status == 128 + signal.SIGTERM
+    assert read_provenance(run.provenance)[-1]["exit_status"] == status
+    assert read_checkpoint(run.checkpoint)["global_step"] == stops_at
+    assert main(["fit", "--resume", str(run)]) == 0
+    assert_same_run(run.path, straight)
 
 
 def test_a_signal_does_not_part_the_batches_of_an_update(tiny_config, tmp_path, monkeypatch):
