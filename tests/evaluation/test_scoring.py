@@ -1,5 +1,8 @@
 """Scoring a split where the memory does not suffice."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from torch import nn
@@ -48,6 +51,32 @@ def test_a_batch_for_which_the_memory_does_not_suffice_is_halved_loudly(limit, e
 def test_a_sequence_that_does_not_fit_alone_is_an_error_with_a_remedy():
     with pytest.raises(ForbesError, match=r"runs/a: no memory for one sequence with K=9. Choose fewer particles"):
         score_split(nn.Linear(1, 1), batches(), hungry(0, OUT_OF_MEMORY[0]), where="runs/a")
+
+
+LIMITED = """
+import resource
+import forbes
+
+data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
+world = forbes.WorldModel.for_data(data)
+
+def score(batch_size):
+    return forbes.evaluate(world.model, data, ["elbo"], sequences=512, samples=1, batch_size=batch_size)["elbo"]
+
+alone = score(8)  # also loads what torch loads when it is first used
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 60 * 2**20,) * 2)  # all 512 take 200 MiB
+halved = score(512)
+assert abs(halved.mean - alone.mean) < 4 * alone.standard_error  # other batches have other noise
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
+def test_an_evaluation_with_too_little_memory_is_halved_and_ends():
+    done = subprocess.run([sys.executable, "-c", LIMITED], capture_output=True, text=True, timeout=300)
+
+    assert done.returncode == 0, done.stderr
+    assert "no memory for 512 sequences at once, trying 256" in done.stderr
 
 
 def noise_of(seed, parts=None):

@@ -202,8 +202,10 @@ was left over, was not one sentence, or had a traceback. {notes}
   package needs no failpoints of its own.
 - **Left over:** no process of its session lives two seconds after a command has ended; no temporary file is in the
   folder after it has been begun again.
-- **Not tested here:** a power loss (files are synced before they are renamed, but no disk was cut off), network file
-  systems, Windows; too little memory (`tests/evaluation/test_scoring.py` injects the errors).
+- **Too little memory** is tested in `tests/evaluation/test_scoring.py`: an evaluation whose address space is limited
+  scores smaller batches and says so.
+- **Not tested:** a power loss (files are synced before they are renamed, but no disk was cut off), network file
+  systems, Windows.
 
 forbes {version}, {system}, {day}, {minutes} minutes.
 """
