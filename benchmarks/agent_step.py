@@ -26,15 +26,15 @@ from torch import Tensor
 from train_step import Operations, common_options, conditions, publish, ratio, say
 
 from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.callbacks.cuda_graph import Recording
 from forbes.control.agent import Agent
 from forbes.data import Replay, SequenceBatch, SequenceDataModule
-from forbes.data.collection import collect_episodes, play, random_policy
-from forbes.data.episode_store import EpisodeWriter
+from forbes.data.episodes.collection import collect_episodes, play, random_policy
+from forbes.data.episodes.store import EpisodeWriter
 from forbes.envs import Environment, Step, find_environment
 from forbes.errors import ForbesError
 from forbes.models import MLPDecoder, MLPEncoder, VectorNormal
 from forbes.training import ImaginationActorCritic
-from forbes.training.callbacks.cuda_graph import Recording
 
 EPISODES = 10
 NAMES = {"dreamer": "Dreamer, N = 1", "forbes": "FORBES, N = 1", "forbes4": "FORBES, N = 4"}

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
 from forbes.beliefs import FlowBelief
-from forbes.beliefs.flows import LOG_SCALE_BOUND, AffineCoupling, LULinear
+from forbes.beliefs.coupling import LOG_SCALE_BOUND, AffineCoupling, LULinear
 from forbes.models import ElboTerms, StateSpaceModel
 
 __all__ = ["Textbook"]

@@ -28,8 +28,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.models import elbo_loss
+from forbes.runs.configuration import allow_modules, experiment_parser
 from forbes.training import WorldModel
-from forbes.training.configuration import allow_modules, experiment_parser
 
 ROOT = Path(__file__).parents[1]
 SHAPES = ("strokes", "dmc")

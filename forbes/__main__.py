@@ -2,7 +2,7 @@
 
 import sys
 
-from forbes.cli import main
+from forbes.commands.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -8,9 +8,9 @@ import pytest
 import torch
 from small_strokes import write_config, write_strokes
 
-from forbes.cli import main
-from forbes.training import configuration, loading
-from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.commands.cli import main
+from forbes.runs import configuration, modules
+from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
 
 torch.set_num_threads(1)  # a second thread gains nothing on matrices of this size
 
@@ -61,7 +61,7 @@ def overwritten(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
         content = read_checkpoint(Path(name))
         AtomicCheckpointIO().save_checkpoint(content | {"global_step": content["global_step"] + 1}, name)
 
-    monkeypatch.setattr(loading, "check_weights", check_weights)
+    monkeypatch.setattr(modules, "check_weights", check_weights)
     return read
 
 

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from small_strokes import write_strokes
 
-from forbes.data.episode_store import EpisodeStore
-from forbes.data.stroke_file import load_strokes
+from forbes.data.episodes.store import EpisodeStore
+from forbes.data.strokes.file import load_strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.record import read_arrays, read_record
 from forbes.figures.returns import published_curves
-from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
-from forbes.training.provenance import read_provenance
-from forbes.training.run_folder import read_config, read_metrics
+from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.folder import read_config, read_metrics
+from forbes.runs.provenance import read_provenance
 
 __all__ = ["KINDS", "TYPES", "damaged", "read_or_sentence"]
 

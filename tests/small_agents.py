@@ -1,6 +1,6 @@
 """Agents that train in a second on a toy, through the command line."""
 
-from forbes.cli import main
+from forbes.commands.cli import main
 
 __all__ = ["fit", "forbes", "write_config", "write_image_config"]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from forbes.data.stroke_file import StrokeArrays, save_strokes
+from forbes.data.strokes.file import StrokeArrays, save_strokes
 
 __all__ = ["write_config", "write_strokes"]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from forbes.training.configuration import allow_modules, experiment_parser
+from forbes.runs.configuration import allow_modules, experiment_parser
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 CLAIM = re.compile(r"\(([\d,]+)(?: parameters)? against ([\d,]+)\)")

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import pytest
 
-from forbes.data.episode_store import EpisodeStore
+from forbes.commands.parsers import compare
+from forbes.data.episodes.store import EpisodeStore
 from forbes.evaluation.record import read_record
-from forbes.parsers import compare
-from forbes.training.run_folder import RunFolder
+from forbes.runs.folder import RunFolder
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
@@ -26,7 +26,7 @@ PROGRAMS = ("forbes", "pytest")
 FOLLOW = """
 import json, shlex, sys, traceback
 import pytest
-from forbes.cli import main
+from forbes.commands.cli import main
 
 if __name__ == "__main__":
     programs, statuses = {"forbes": main, "pytest": pytest.main}, {}

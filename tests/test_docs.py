@@ -8,8 +8,8 @@ from pathlib import Path
 import lightning
 import pytest
 
-from forbes.cli import COMMANDS
-from forbes.parsers.fit import DESCRIPTION
+from forbes.commands.cli import COMMANDS
+from forbes.commands.parsers.fit import DESCRIPTION
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -68,7 +68,7 @@ def test_every_command_and_flag_of_a_page_exists(page):
             continue
         assert name in COMMANDS, name
         if name not in DESCRIPTION:
-            known = flags(importlib.import_module(f"forbes.parsers.{name}").parser()) | {"--allow-module"}
+            known = flags(importlib.import_module(f"forbes.commands.parsers.{name}").parser()) | {"--allow-module"}
             assert used <= known, (name, used - known)
 
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from forbes.cli import main
-from forbes.data.episode_store import EpisodeWriter
+from forbes.commands.cli import main
+from forbes.data.episodes.store import EpisodeWriter
 from forbes.errors import ForbesError
 from forbes.files import locked, no_link, replace_file
-from forbes.training.checkpoint import AtomicCheckpointIO
-from forbes.training.metrics_log import JsonLinesLogger
+from forbes.runs.checkpoint import AtomicCheckpointIO
+from forbes.runs.metrics_log import JsonLinesLogger
 
 PRECIOUS = "precious, and without an end of line"
 

@@ -18,21 +18,20 @@ import torch
 from matplotlib.figure import Figure
 from small_agents import fit, forbes, write_config
 
-from forbes.cli import main
+from forbes.callbacks import collect
+from forbes.commands.cli import main
 from forbes.data.download import download
-from forbes.data.episode_store import EpisodeStore, EpisodeWriter
-from forbes.data.episodes import Episode
-from forbes.data.pictures import save_picture
-from forbes.data.stroke_file import load_strokes, save_strokes
+from forbes.data.episodes.episode import Episode
+from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
+from forbes.data.strokes.file import load_strokes, save_strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.record import write_record
 from forbes.evaluation.scoring import Parts
 from forbes.figures.style import save_figure
 from forbes.files import append_whole, locked, replace_file
-from forbes.training.callbacks import collect
-from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
-from forbes.training.metrics_log import JsonLinesLogger
-from forbes.training.run_folder import read_metrics
+from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.folder import read_metrics
+from forbes.runs.metrics_log import JsonLinesLogger
 
 LIMIT = 4000  # bytes of a file: more than an episode below, less than the index of ten
 ENVIRONMENT = {"task": "Counting", "observation_shape": [2], "action_dim": 1, "discrete": False}
@@ -91,7 +90,6 @@ WRITERS = {
     "evaluation.npz": lambda folder, _: write_record(folder, {"elbo": {"mean": 1.0}}, {"elbo": MANY}),
     "0.npz": lambda folder, _: Parts(folder, "key").write(0, {"elbo": MANY}),
     "figure.pdf": lambda folder, _: plot(folder, save_figure, "figure.pdf"),
-    "picture.png": lambda folder, _: plot(folder, save_picture, "picture.png"),
     "strokes.npz": save_all_strokes,
 }
 
@@ -170,7 +168,7 @@ def test_a_full_disk_that_another_library_meets_is_one_sentence(monkeypatch, cap
         def full(arguments, name=name):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *([name] if name else []))
 
-        monkeypatch.setattr("forbes.doctor.main", full)
+        monkeypatch.setattr("forbes.commands.doctor.main", full)
         assert main(["doctor"]) == 2
         assert (
             capsys.readouterr().err == f"forbes: {said} (No space left on device). Make room, or choose another place\n"
@@ -210,9 +208,9 @@ ON_A_FULL_DISK = """
 import json, sys
 from pathlib import Path
 from test_full_disk import append_episodes, left_whole, log_metrics
-from forbes.data.episode_store import EpisodeStore, EpisodeWriter
+from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.errors import ForbesError
-from forbes.training.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
 
 disk, said = Path(sys.argv[1]), []
 AtomicCheckpointIO().save_checkpoint({"number": 0}, disk / "last.ckpt")

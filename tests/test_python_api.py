@@ -18,8 +18,8 @@ import yaml
 from lightning import Trainer
 
 import forbes
-from forbes.cli import main
-from forbes.training.checkpoint import read_checkpoint
+from forbes.commands.cli import main
+from forbes.runs.checkpoint import read_checkpoint
 from forbes.training.defaults import defaults_for
 
 ROOT = Path(forbes.__file__).parents[1]

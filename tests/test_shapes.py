@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from forbes.data import Simulated
-from forbes.data.episodes import Episode
+from forbes.data.episodes.episode import Episode
 from forbes.envs import Step
 from forbes.models import ElboTerms, Rollout, State
 from forbes.pomdps import Tiger, Trajectories

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from forbes.envs.base import Environment, Step
-from forbes.envs.control import DeepMindControl
+from forbes.envs.dm_control import DeepMindControl
 
 
 class Echo(Environment):

@@ -7,8 +7,8 @@ from typing import ClassVar, TypeAlias
 from torch import Tensor, nn
 
 from forbes.configured import Configurable
-from forbes.deferred import Loop
 from forbes.frozen import frozen
+from forbes.performance.time_loop import Loop
 
 __all__ = ["BeliefFamily", "BeliefHead", "Sampler"]
 
@@ -63,7 +63,7 @@ class BeliefHead(Configurable, nn.Module, ABC):
     def sampler(self, loop: Loop) -> Sampler:
         """Prepare `rsample` for a time loop: what does not depend on the context is computed once, here.
 
-        A family may bind its weights to the loop (see `forbes.deferred`); the default does not.
+        A family may bind its weights to the loop (see `forbes.performance.time_loop`); the default does not.
         """
         return self.rsample
 

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor, nn
 
 from forbes.beliefs.base import BeliefHead, Sampler
-from forbes.deferred import Loop
 from forbes.errors import ForbesError
+from forbes.performance.time_loop import Loop
 
 __all__ = ["CategoricalBelief", "draw_one_hot", "one_hot_of"]
 

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from forbes.beliefs.base import BeliefHead, Sampler
-from forbes.beliefs.flows import AffineCoupling, ConditionalFlow
+from forbes.beliefs.coupling import AffineCoupling, ConditionalFlow
 from forbes.beliefs.gaussian import GaussianBelief
 from forbes.beliefs.splines import SplineCoupling
-from forbes.deferred import Loop
+from forbes.performance.time_loop import Loop
 
 __all__ = ["FlowBelief"]
 

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.base import BeliefHead, Sampler
-from forbes.deferred import Loop
-from forbes.fusion import fused
+from forbes.performance.fusion import fused
+from forbes.performance.time_loop import Loop
 
 __all__ = ["GaussianBelief", "standard_normal_log_prob"]
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.base import BeliefHead, Sampler
-from forbes.deferred import Loop
+from forbes.performance.time_loop import Loop
 from forbes.shapes import printed_by_shape
 
 __all__ = ["Mixture", "MixtureBelief"]

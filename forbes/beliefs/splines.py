@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from forbes.beliefs.flows import Coupling, FlowMap, LULinear
-from forbes.deferred import Bind, bind_now
+from forbes.beliefs.coupling import Coupling, FlowMap, LULinear
 from forbes.errors import ForbesError
-from forbes.fusion import fused
+from forbes.performance.fusion import fused
+from forbes.performance.time_loop import Bind, bind_now
 
 __all__ = ["SplineCoupling", "knot_table", "spline", "spline_inverse"]
 

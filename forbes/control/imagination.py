@@ -12,7 +12,7 @@ reward that comes with it belongs to that next state, as it does in stored seque
 import torch
 
 from forbes.models import Filtered, State, StateSpaceModel
-from forbes.precision import full_precision
+from forbes.performance.precision import full_precision
 
 __all__ = ["belief_samples"]
 

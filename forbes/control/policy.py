@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.categorical import draw_one_hot, one_hot_of
-from forbes.fusion import fused
 from forbes.models.networks import Perceptron
+from forbes.performance.fusion import fused
 
 __all__ = ["Actor", "OneHotCategorical", "Policy", "ScalarHead", "TanhNormal"]
 

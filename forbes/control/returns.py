@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from forbes.fusion import fused
+from forbes.performance.fusion import fused
 
 __all__ = ["actor_loss", "critic_loss", "lambda_returns"]
 

@@ -1,11 +1,11 @@
 """Data: one DataModule, several sources of sequences."""
 
 from forbes.data.datamodule import SequenceDataModule
-from forbes.data.experience import Experience
-from forbes.data.replay import Replay
+from forbes.data.episodes.experience import Experience
+from forbes.data.episodes.replay import Replay
 from forbes.data.simulated import Simulated
 from forbes.data.source import SequenceBatch, SequenceSource, Split
-from forbes.data.strokes import Strokes
+from forbes.data.strokes.source import Strokes
 
 __all__ = [
     "Experience",

@@ -1,9 +1,13 @@
-"""Data that do not come with the package: where they are kept, how they are downloaded and recognised."""
+"""Data that do not come with the package: where they are kept, how they are downloaded and recognised.
+
+Among them the learning curves of danijar/dreamer on the DeepMind Control Suite (MIT licence).
+"""
 
 import hashlib
 import http
 import http.client
 import os
+import shutil
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -13,10 +17,31 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from forbes.errors import ForbesError
 from forbes.files import append_whole
 
-__all__ = ["data_folder", "download", "git_blob_id"]
+__all__ = [
+    "CURVES_BLOB",
+    "CURVES_URL",
+    "bundled",
+    "curves_path",
+    "data_folder",
+    "download",
+    "fetch_curves",
+    "git_blob_id",
+]
 
 _DOWNLOAD_LIMIT = 100 * 2**20  # bytes; GitHub stores no larger file
 _CHUNK = 2**16
+
+CURVES_URL = "https://github.com/danijar/dreamer/raw/master/scores/dreamer.json"
+CURVES_BLOB = "ab35b223497127c8eb4cf1b17db7afd4389c4faf"
+"""20 tasks, 5 seeds each, returns against env steps up to 4.9 million."""
+
+_LOCAL = "Give a local copy with: forbes data fetch curves --from PATH"
+
+
+def bundled(name: str) -> Path:
+    """Return the path of a file that comes with the package: `forbes/data/` of a wheel, `data/` of a checkout."""
+    in_wheel = Path(__file__).with_name(name)
+    return in_wheel if in_wheel.is_file() else Path(__file__).parents[2] / "data" / name
 
 
 def data_folder() -> Path:
@@ -81,3 +106,33 @@ def git_blob_id(path: Path) -> str:
         while chunk := file.read(_CHUNK):
             digest.update(chunk)
     return digest.hexdigest()
+
+
+def curves_path() -> Path:
+    """Where they are kept."""
+    return data_folder() / "dreamer-curves.json"
+
+
+def fetch_curves(source: Path | None, destination: Path) -> None:
+    """Store the curves, verified.
+
+    Args:
+        source: a copy of the file; None downloads it.
+        destination: where it comes to lie, whole or not at all.
+
+    Raises:
+        ForbesError: where it cannot be had, or is another file.
+    """
+    new = destination.with_name(f"{destination.name}.new")
+    if source is None:
+        download(CURVES_URL, new, _LOCAL)
+    elif source.is_file():
+        new.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, new)
+    else:
+        raise ForbesError(f"{source}: there is no such file. {_LOCAL}")
+    found = git_blob_id(new)
+    if found != CURVES_BLOB:
+        new.unlink()
+        raise ForbesError(f"{source or CURVES_URL}: the git blob id is {found}, expected {CURVES_BLOB}. {_LOCAL}")
+    new.replace(destination)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from forbes.arguments import Split
+from forbes.choices import Split
 from forbes.errors import ForbesError
 from forbes.named import Named
 from forbes.seeding import generator

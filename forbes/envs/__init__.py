@@ -4,7 +4,7 @@ Nothing here imports a simulator, torch or gymnasium before it is asked for: a w
 """
 
 from forbes.envs.base import TIME_LIMIT, Environment, Step
-from forbes.envs.control import DeepMindControl
+from forbes.envs.dm_control import DeepMindControl
 from forbes.envs.gymnasium import Gymnasium
 from forbes.envs.tasks import find_environment
 from forbes.envs.worker import BrokenEnvironmentError, EnvironmentProcess

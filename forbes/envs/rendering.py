@@ -10,11 +10,8 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from functools import lru_cache
 from typing import NamedTuple
-
-import numpy as np
 
 from forbes.errors import ForbesError
 
@@ -28,8 +25,7 @@ _INSTALL = {
     "egl": "apt-get install libegl1 libgl1-mesa-dri; in a container with a GPU, NVIDIA_DRIVER_CAPABILITIES=all",
     "osmesa": "apt-get install libosmesa6",
 }
-_FRAMES = 10
-_PROGRAM = "import sys; from forbes.envs.rendering import measure; measure(sys.argv[1])"
+_PROGRAM = "import sys; from forbes.envs.dm_control import measure; measure(sys.argv[1])"
 
 
 class Probe(NamedTuple):
@@ -90,21 +86,3 @@ def choose_backend() -> Probe:
     raise ForbesError(
         f"rendering: {failure} ({problems}). `forbes doctor` has the remedy; vectors need no rendering: --no-pixels"
     )
-
-
-def measure(backend: str) -> None:
-    """Print GL_RENDERER and frames per second as JSON; in the probe's own process.
-
-    Raises:
-        RuntimeError: when the same state does not give the same frame.
-    """
-    from forbes.envs.control import DeepMindControl
-
-    environment = DeepMindControl("cartpole_balance", action_repeat=1, backend=backend)
-    if (environment.reset(0).observation != environment.reset(0).observation).any():
-        raise RuntimeError("the same state gives two different frames")
-    action, began = np.zeros(environment.action_dim, np.float32), time.perf_counter()
-    for _ in range(_FRAMES):
-        environment.step(action)
-    frames_per_second = _FRAMES / (time.perf_counter() - began)
-    print(json.dumps([environment.describe()["made_by"]["gl_renderer"], frames_per_second]))

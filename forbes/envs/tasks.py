@@ -9,7 +9,7 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from forbes.envs.base import Environment
-from forbes.envs.control import DeepMindControl
+from forbes.envs.dm_control import DeepMindControl
 from forbes.envs.gymnasium import Gymnasium
 from forbes.errors import ForbesError
 

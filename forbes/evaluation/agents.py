@@ -1,44 +1,39 @@
 """What agents earn: whole episodes without exploration, each agent in the same ones."""
 
-import itertools
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 from torch import Tensor
 
 from forbes.data import Experience
-from forbes.data.collection import describe_environment
-from forbes.data.episodes import Episode
+from forbes.data.episodes.collection import describe_environment
+from forbes.data.episodes.episode import Episode
 from forbes.envs import Environment, EnvironmentProcess
 from forbes.envs.known_process import KnownProcess
 from forbes.errors import ForbesError
+from forbes.evaluation.agent_beliefs import exact_variance, learned_variance, prior_and_posterior, uncertainty
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
-from forbes.evaluation.foresight import SAMPLES, STEPS_AHEAD, explained, foretell
-from forbes.evaluation.gaussianity import prior_and_posterior
 from forbes.evaluation.record import require_readable, write_record
-from forbes.evaluation.reward_uncertainty import exact_variance, learned_variance, uncertainty
+from forbes.evaluation.reward_prediction import SAMPLES, STEPS_AHEAD, explained, foretell
 from forbes.pomdps import Process
+from forbes.runs.provenance import commit
 from forbes.seeding import derive_seed
 from forbes.training.acting import ActingModel, play_measured
 from forbes.training.loading import load_run, loaded_agent
-from forbes.training.provenance import commit
 
-__all__ = ["evaluate_agents", "is_agent", "play_test_episode"]
+__all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", "play_test_episode"]
 
-_DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
-_REWARD = "reward_uncertainty"
+DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
+REWARD = "reward_uncertainty"
 _APART = ("made_by", "shows", "observation_shape")
 """In what environments of one task may differ: an agent that is shown the exact belief earns the same rewards."""
 
 
-class _Played(NamedTuple):
+class PlayedAgent(NamedTuple):
     """A run and the episodes it was measured in."""
 
     run: str
@@ -48,8 +43,8 @@ class _Played(NamedTuple):
     explained: list[Estimate | None]
     """The share of the rewards' variance that the world model foretold, for each of `STEPS_AHEAD`."""
     belief: dict[str, Estimate]
-    """What is said of the belief, by metric: `_DISTANCES` from a Gaussian, where s is
-    continuous, and `_REWARD`, where the exact belief is known."""
+    """What is said of the belief, by metric: `DISTANCES` from a Gaussian, where s is
+    continuous, and `REWARD`, where the exact belief is known."""
     environment: dict[str, Any]
     checkpoint: str
     """SHA-256 of the one that has played."""
@@ -65,8 +60,8 @@ def is_agent(run: str) -> bool:
 
 def evaluate_agents(
     runs: Mapping[str, Path], episodes: int, samples: int | None, seed: int, device: str, command: str
-) -> None:
-    """Let every agent play the same episodes, record its returns, and print a table.
+) -> list[PlayedAgent]:
+    """Let every agent play the same episodes, and record its returns.
 
     Episode k of every run is reset with the same seed, none of which was used in a training. The action is the policy's
     mode, or the plan, without noise.
@@ -85,19 +80,19 @@ def evaluate_agents(
     if episodes < 2:
         raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
     require_readable(runs.values())
-    played = list[_Played]()
+    played: list[PlayedAgent] = []
     for run, folder in runs.items():
         with loaded_agent(run, device, samples) as (agent, environment, checkpoint):
             for first in played[:1]:
                 _require_same_task(first, run, describe_environment(environment))
             played.append(_play(run, agent, environment, checkpoint, episodes, seed))
         _record(played[-1], folder, seed, command)
-    _print(played)
+    return played
 
 
 def _play(
     run: str, agent: ActingModel, environment: EnvironmentProcess, checkpoint: str, episodes: int, seed: int
-) -> _Played:
+) -> PlayedAgent:
     returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
     process, variances, distances = _known_process(environment), list[tuple[Tensor, Tensor]](), list[Tensor]()
     for number in _counted(run, episodes):
@@ -113,10 +108,10 @@ def _play(
     total = torch.tensor(returns, dtype=torch.float64)  # (E,)
     belief = dict[str, Estimate]()
     if distances:
-        belief |= zip(_DISTANCES, map(Estimate.of, torch.stack(distances, 1)), strict=True)  # 2 x (E,)
+        belief |= zip(DISTANCES, map(Estimate.of, torch.stack(distances, 1)), strict=True)  # 2 x (E,)
     if variances:
-        belief[_REWARD] = uncertainty(*zip(*variances, strict=True))
-    return _Played(
+        belief[REWARD] = uncertainty(*zip(*variances, strict=True))
+    return PlayedAgent(
         run, agent, total, explained(foretold, rewards), belief, describe_environment(environment), checkpoint
     )
 
@@ -129,7 +124,7 @@ def _known_process(environment: EnvironmentProcess) -> Process | None:
     return known.process if isinstance(known, KnownProcess) else None
 
 
-def _record(one: _Played, folder: Path, seed: int, command: str) -> None:
+def _record(one: PlayedAgent, folder: Path, seed: int, command: str) -> None:
     measured = {
         "checkpoint": one.checkpoint,
         "command": command,
@@ -167,52 +162,10 @@ def _counted(run: str, episodes: int) -> Iterator[int]:
         print(f"{run}: {number + 1}/{episodes} episodes", file=sys.stderr, flush=True)
 
 
-def _require_same_task(first: _Played, run: str, task: dict[str, Any]) -> None:
+def _require_same_task(first: PlayedAgent, run: str, task: dict[str, Any]) -> None:
     ours, theirs = ({k: v for k, v in each.items() if k not in _APART} for each in (first.environment, task))
     if ours != theirs:
         raise ForbesError(
             f"{run}: its task is {theirs['task']} ({theirs}), that of {first.run} is {ours['task']} ({ours}), "
             "expected the same. Compare agents of one task"
         )
-
-
-def _print(played: Sequence[_Played]) -> None:
-    console = Console(width=None if sys.stdout.isatty() else 160)
-    episodes, how = len(played[0].returns), "undiscounted, mean ± standard error; the same episodes for all"
-    table = Table(title=f"return in {episodes} episodes, by the mean action of K trajectories of the belief: {how}")
-    for header in ("run", "agent", "parameters", "K", "return", "lowest", "highest"):
-        table.add_column(header, overflow="fold", justify="left" if header in ("run", "agent") else "right")
-    for one in played:
-        size = sum(parameter.numel() for parameter in one.agent.parameters())
-        ends = (f"{end.item():.1f}" for end in (one.returns.min(), one.returns.max()))
-        kind = f"{type(one.agent).__name__}, {type(one.agent.model.posterior).__name__}"
-        samples = str(one.agent.acting_samples)
-        table.add_row(escape(one.run), kind, f"{size:,}", samples, str(Estimate.of(one.returns)), *ends)
-    console.print(table)
-    console.print(_foresight(played))
-    if any(one.belief for one in played):
-        console.print(_beliefs(played))
-    for first, second in itertools.combinations(played, 2):
-        difference = Estimate.of(first.returns - second.returns)
-        console.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
-
-
-def _foresight(played: Sequence[_Played]) -> Table:
-    title = "share of the rewards' variance in these episodes that the world model foretells, by the actions taken"
-    table = Table("run", title=f"{title}; 0 is as good as the mean reward")
-    for distance in STEPS_AHEAD:
-        table.add_column(f"{distance} steps ahead" if distance else "when seen", justify="right")
-    for one in played:
-        table.add_row(escape(one.run), *("n/a" if share is None else str(share) for share in one.explained))
-    return table
-
-
-def _beliefs(played: Sequence[_Played]) -> Table:
-    table = Table("run", title="the belief: its KL from the nearest Gaussian; how unsure it is of a reward it has met")
-    for column in ("prior, nats a step", "posterior, nats a step", "variance of the reward / exact belief's"):
-        table.add_column(column, justify="right")
-    for one in played:
-        *distances, reward = (one.belief.get(metric) for metric in (*_DISTANCES, _REWARD))
-        nats = ("n/a" if each is None else f"{each.mean:z.3f} ± {each.standard_error:.3f}" for each in distances)
-        table.add_row(escape(one.run), *nats, "n/a" if reward is None else str(reward))
-    return table

@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from forbes.evaluation.bounds import Increments
+from forbes.evaluation.scores import Increments
 from forbes.pomdps import (
     ExactBelief,
     GaussianMixtureBelief,

@@ -15,9 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from forbes.errors import ForbesError
-from forbes.evaluation.degradation import at_horizons, degradation
 from forbes.evaluation.estimates import Estimate
-from forbes.evaluation.measured import SCORES, score_of
+from forbes.evaluation.metrics import SCORES, at_horizons, degradation, score_of
 from forbes.evaluation.record import read_arrays, read_record
 from forbes.evaluation.references import lowest_above
 

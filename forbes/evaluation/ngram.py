@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from forbes.data import Split, Strokes
-from forbes.data.stroke_file import SIDE
-from forbes.data.strokes import StrokePoints
+from forbes.data.strokes.file import SIDE
+from forbes.data.strokes.source import StrokePoints
 
 __all__ = ["ORDERS", "NGrams", "fit_ngrams"]
 

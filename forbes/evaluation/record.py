@@ -22,7 +22,7 @@ from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.scoring import Scores
 from forbes.files import no_link, remove_halves, replace_file
 from forbes.reading import is_number, read_json, read_npz, shortened
-from forbes.training.run_folder import RunFolder
+from forbes.runs.folder import RunFolder
 
 __all__ = ["describe", "read_arrays", "read_record", "require_readable", "results_folders", "write_record"]
 

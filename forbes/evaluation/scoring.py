@@ -4,7 +4,7 @@ import hashlib
 import io
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -12,23 +12,34 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
 from torch import Tensor
 
+from forbes.choices import PASSES, SUBSET
 from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
-from forbes.evaluation.bounds import Increments, score_predictions, score_trajectories
 from forbes.evaluation.estimates import Estimate
-from forbes.evaluation.open_loop import score_open_loop
 from forbes.evaluation.runs import split_batches
-from forbes.evaluation.smc import score_particles
+from forbes.evaluation.scores import Increments, score_open_loop, score_particles, score_predictions, score_trajectories
 from forbes.files import replace_file
 from forbes.models import BeliefModel, StateSpaceModel
-from forbes.parsers.evaluate import PASSES, SUBSET
 from forbes.pomdps import Process
 from forbes.reading import read_npz
 from forbes.seeding import derive_seed
 
-__all__ = ["Parts", "Pass", "Scores", "evaluate", "exact_pass", "make_pass", "require_finite", "score_split"]
+__all__ = [
+    "Parts",
+    "Pass",
+    "Scores",
+    "evaluate",
+    "exact_pass",
+    "make_pass",
+    "require_finite",
+    "score_split",
+    "with_progress",
+]
 
 
 class Pass(NamedTuple):
@@ -276,3 +287,20 @@ def require_finite(where: str, first: int, scores: Increments) -> None:
                 f"{where}: the {name} of sequence {first + place} is {values[place].sum().item()}, expected a finite "
                 "number. The training diverged: train again with a smaller learning_rate"
             )
+
+
+def with_progress(
+    batches: Iterator[tuple[int, SequenceBatch]], name: str, sequences: int
+) -> Iterator[tuple[int, SequenceBatch]]:
+    """Pass batches on, with a bar on a terminal and a line at each tenth elsewhere."""
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(escape(name), total=sequences)
+        tenth = 0
+        for first, batch in batches:
+            yield first, batch
+            bar.advance(task, len(batch.mask))
+            done = first + len(batch.mask)
+            if bar.disable and 10 * done // sequences > tenth:
+                tenth = 10 * done // sequences
+                print(f"{name}: {done}/{sequences} sequences", file=sys.stderr, flush=True)

@@ -11,8 +11,8 @@ from matplotlib.patches import Patch
 from torch import Tensor
 
 from forbes.errors import ForbesError
-from forbes.evaluation.calibration import coverage
-from forbes.evaluation.uniformity import binomial_interval, ecdf_band
+from forbes.evaluation.calibration.ranks import coverage
+from forbes.evaluation.calibration.uniformity import binomial_interval, ecdf_band
 from forbes.figures.style import BLACK, GREY, PAGE, paper_style
 from forbes.seeding import generator
 
@@ -24,7 +24,7 @@ _LEVELS = 101
 
 
 class RankedBelief(NamedTuple):
-    """A belief with the ranks of N true values among L of its samples (`forbes.evaluation.calibration.ranks`)."""
+    """A belief with the ranks of N true values among L of its samples (`forbes.evaluation.calibration.ranks.ranks`)."""
 
     name: str
     colour: str

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from forbes.evaluation.comparison import Comparison
-from forbes.evaluation.measured import SCORES, score_of
+from forbes.evaluation.metrics import SCORES, score_of
 from forbes.figures.style import COLUMN, GREY, PAGE, PALETTE, draw_references, paper_style
 
 __all__ = ["differences", "per_step", "scores"]

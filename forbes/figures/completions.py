@@ -12,8 +12,8 @@ from matplotlib.ticker import StrMethodFormatter
 from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceSource
-from forbes.evaluation.completion_scores import entropy
-from forbes.evaluation.completion_study import Row, Study
+from forbes.evaluation.digits.scores import entropy
+from forbes.evaluation.digits.study import Row, Study
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Bars, Panel, draw_bands

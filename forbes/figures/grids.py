@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from forbes.data.pictures import MAX_CHANNELS, to_rgb
 from forbes.errors import ForbesError
+from forbes.figures.episodes import MAX_CHANNELS, to_rgb
 from forbes.figures.style import BLACK, GREY, PAGE, paper_style
 
 __all__ = ["Bars", "Panel", "draw_bands", "draw_panels", "require_images", "seen_panel", "truth_panel"]

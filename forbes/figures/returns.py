@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from forbes.data.published import curves_path
+from forbes.data.download import curves_path
 from forbes.errors import ForbesError
 from forbes.figures.style import COLUMN, GREY, ORANGE, PALETTE, draw_range, paper_style
 from forbes.reading import read_json, readable

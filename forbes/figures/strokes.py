@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Strokes
-from forbes.evaluation.neighbours import Beginnings, last_frame
+from forbes.evaluation.digits.neighbours import Beginnings, last_frame
 from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import COLUMN, draw_range, draw_references, paper_style, show_settled

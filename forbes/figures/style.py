@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
+from forbes.errors import ForbesError
 from forbes.files import replace_file
 
 __all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "density_map", "draw_range"]
@@ -57,12 +58,19 @@ def paper_style() -> Iterator[None]:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a picture in the format of the path's suffix; a reader never sees half of it, old or new."""
+    """Write a picture in the format of the path's suffix; a reader never sees half of it, old or new.
+
+    Raises:
+        ForbesError: for a suffix that is no format of pictures.
+    """
     content = io.BytesIO()
     # Without a date, the same picture is the same bytes.
     metadata = {"CreationDate": None} if path.suffix == ".pdf" else None
-    with paper_style():
-        figure.savefig(content, format=path.suffix[1:], metadata=metadata)
+    try:
+        with paper_style():
+            figure.savefig(content, format=path.suffix[1:] or "png", metadata=metadata)
+    except ValueError as error:
+        raise ForbesError(f"{path}: is no picture's name ({error}). End it in .png") from error
     replace_file(path, content.getvalue())
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from forbes.data.pictures import to_rgb
+from forbes.figures.episodes import to_rgb
 
 __all__ = ["gif"]
 

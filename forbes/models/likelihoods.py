@@ -9,7 +9,7 @@ from torch.distributions import Categorical
 from torch.nn.functional import log_softmax, one_hot, pad, softplus
 
 from forbes.errors import ForbesError
-from forbes.fusion import fused
+from forbes.performance.fusion import fused
 
 __all__ = ["Bernoulli", "Likelihood", "Normal", "OneHot", "OnePixel", "VectorNormal"]
 

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.nn.functional import elu, relu
 
 from forbes.configured import Configurable
-from forbes.deferred import Loop
 from forbes.errors import ForbesError
-from forbes.fusion import Elementwise, fused
+from forbes.performance.fusion import Elementwise, fused
+from forbes.performance.time_loop import Loop
 
 __all__ = [
     "ConvDecoder",

@@ -27,7 +27,7 @@ from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder
 from forbes.models.state_space import StateSpaceModel
-from forbes.precision import full_precision
+from forbes.performance.precision import full_precision
 from forbes.shapes import printed_by_shape
 
 __all__ = ["ParticleModel", "Particles", "effective_sample_size", "run_particles", "soft", "systematic"]

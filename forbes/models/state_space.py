@@ -17,13 +17,13 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from forbes.beliefs import BeliefFamily, BeliefHead
-from forbes.deferred import Affine, Loop
 from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, Perceptron, bind_gru
-from forbes.precision import full_precision
+from forbes.performance.precision import full_precision
+from forbes.performance.time_loop import Affine, Loop
 from forbes.shapes import printed_by_shape
 
 __all__ = ["Filtered", "StateSpaceModel"]

@@ -16,13 +16,13 @@ import torch
 from torch import Tensor, nn
 
 from forbes.beliefs import BeliefFamily
-from forbes.deferred import Loop
 from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, bind_gru
-from forbes.precision import full_precision
+from forbes.performance.precision import full_precision
+from forbes.performance.time_loop import Loop
 
 __all__ = ["VectorModel"]
 

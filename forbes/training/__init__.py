@@ -1,7 +1,7 @@
 """Training: LightningModules that optimise and log."""
 
 from forbes.training.actor_critic import ImaginationActorCritic
-from forbes.training.known_model import KnownBelief
+from forbes.training.known_belief import KnownBelief
 from forbes.training.planning_agent import PlanningAgent
 from forbes.training.world_model import WorldModel
 

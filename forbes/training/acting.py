@@ -11,8 +11,8 @@ from torch import Tensor
 from forbes.control.agent import Agent, Choice
 from forbes.control.policy import ScalarHead
 from forbes.data import SequenceBatch, SequenceDataModule
-from forbes.data.collection import episode_seed, play_whole
-from forbes.data.episodes import Episode
+from forbes.data.episodes.collection import episode_seed, play_whole
+from forbes.data.episodes.episode import Episode
 from forbes.envs import Environment
 from forbes.errors import ForbesError
 from forbes.models import Filtered, Seen, StateSpaceModel

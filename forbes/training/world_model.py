@@ -20,11 +20,11 @@ from forbes.models.elbo import KL, ElboTerms, FreeNats, elbo_loss
 from forbes.models.likelihoods import Likelihood, Normal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
 from forbes.models.state_space import StateSpaceModel
+from forbes.runs.hyperparameters import plain_arguments
 from forbes.seeding import derive_seed
 from forbes.signatures import full_signature
 from forbes.training.defaults import defaults_for
 from forbes.training.divergence import hold_unless_finite
-from forbes.training.hyperparameters import plain_arguments
 from forbes.training.requirements import require_mean, require_path, require_rank
 
 __all__ = ["Group", "Objective", "WorldModel", "batches_before", "follow_rates", "require_at_least", "together"]
@@ -180,7 +180,7 @@ class WorldModel(LightningModule):
         Raises:
             ForbesError: where the checkpoint is damaged, of another class, or does not fit the arguments.
         """
-        from forbes.training.loading import load_module  # it imports the models
+        from forbes.runs.modules import load_module  # it imports the models
 
         return load_module(Path(checkpoint_path), cls, arguments).train().to(map_location)
 

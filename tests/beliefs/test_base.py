@@ -17,7 +17,7 @@ from forbes.beliefs import (
     GaussianBelief,
     MixtureBelief,
 )
-from forbes.deferred import Loop
+from forbes.performance.time_loop import Loop
 
 CONTEXT = 3
 CLASSES = 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
-from forbes.data.stroke_file import StrokeArrays
+from forbes.data.strokes.file import StrokeArrays
 
 # The same examples in every run, and no failure because the machine is busy.
 settings.register_profile("strokes", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])

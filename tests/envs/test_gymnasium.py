@@ -11,9 +11,9 @@ gymnasium = pytest.importorskip("gymnasium")
 import toy_gymnasium  # noqa: E402
 from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiDiscrete, OneOf, Sequence, Text, Tuple  # noqa: E402
 
-from forbes.cli import main  # noqa: E402
+from forbes.commands.cli import main  # noqa: E402
 from forbes.data import Experience  # noqa: E402
-from forbes.data.episode_store import EpisodeStore  # noqa: E402
+from forbes.data.episodes.store import EpisodeStore  # noqa: E402
 from forbes.envs import Gymnasium, find_environment  # noqa: E402
 from forbes.envs.base import check_step  # noqa: E402
 from forbes.errors import ForbesError  # noqa: E402

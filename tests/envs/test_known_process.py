@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from forbes.data.collection import play, random_policy
+from forbes.data.episodes.collection import play, random_policy
 from forbes.envs import find_environment
 from forbes.envs.known_process import KnownProcess
 from forbes.errors import ForbesError

@@ -2,7 +2,7 @@
 
 import pytest
 
-from forbes.cli import main
+from forbes.commands.cli import main
 from forbes.envs import rendering
 from forbes.envs.rendering import Probe, choose_backend, probe_backend
 from forbes.errors import ForbesError

@@ -7,7 +7,7 @@ import pytest
 from small_agents import fit, forbes, write_config
 
 from forbes.control.agent import Agent
-from forbes.data.episode_store import EpisodeStore
+from forbes.data.episodes.store import EpisodeStore
 from forbes.evaluation.record import read_arrays, read_record
 from forbes.seeding import derive_seed
 from forbes.training.loading import load_run

@@ -7,7 +7,7 @@ import torch
 from small_agents import fit, forbes, write_config
 
 from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
-from forbes.evaluation.gaussianity import non_gaussianity
+from forbes.evaluation.agent_beliefs import non_gaussianity
 from forbes.evaluation.record import read_record
 
 CONTEXTS = torch.randn(200, 5, generator=torch.Generator().manual_seed(0))

@@ -9,7 +9,7 @@ import time
 import pytest
 import torch
 
-from forbes.cli import main
+from forbes.commands.cli import main
 from forbes.evaluation import record
 from forbes.evaluation.record import read_record, write_record
 

@@ -7,10 +7,10 @@ import torch
 from small_agents import fit, forbes, write_config
 from torch import nn
 
-from forbes.data.collection import play, random_policy
+from forbes.data.episodes.collection import play, random_policy
 from forbes.envs.known_process import KnownProcess
+from forbes.evaluation.agent_beliefs import DRAWS, exact_variance, learned_variance, uncertainty
 from forbes.evaluation.record import read_record
-from forbes.evaluation.reward_uncertainty import DRAWS, exact_variance, learned_variance, uncertainty
 from forbes.models import Filtered
 from forbes.pomdps import MountainHike, Tiger
 

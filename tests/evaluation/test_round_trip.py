@@ -9,7 +9,7 @@ import torch
 from small_models import make_model, random_model, sequences
 
 from forbes.beliefs import FlowBelief
-from forbes.cli import main
+from forbes.commands.cli import main
 from forbes.data import SequenceBatch
 from forbes.evaluation.round_trip import LIMIT, model_round_trip, print_round_trip, round_trip
 

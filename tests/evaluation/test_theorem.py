@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.distributions import MultivariateNormal
 
-from forbes.cli import main
+from forbes.commands.cli import main
 from forbes.evaluation.theorem import (
     Conditional,
     LinearGaussian,

@@ -23,8 +23,8 @@ from damage import KINDS
 from faults import fuzz, kills, resources
 from faults.outcome import Outcome
 
-import forbes.evaluation.commands
-import forbes.training.commands
+import forbes.commands.evaluate
+import forbes.commands.fit
 
 CHUNK = 100  # inputs of a task
 SIZES = 100, 3_000, 30_000, 300_000  # bytes

@@ -20,7 +20,7 @@ from damage import Kind, damaged, read_or_sentence
 from faults.outcome import Outcome
 from faults.victims import changed_file
 
-from forbes.cli import main
+from forbes.commands.cli import main
 
 __all__ = ["configurations", "reader"]
 

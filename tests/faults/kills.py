@@ -17,11 +17,11 @@ import torch
 from faults.outcome import Outcome
 from faults.victims import Ending, Fault, run, run_real
 
-from forbes.data.episode_store import EpisodeStore
+from forbes.data.episodes.store import EpisodeStore
 from forbes.errors import ForbesError
 from forbes.evaluation.record import read_arrays, read_record
-from forbes.training.checkpoint import read_checkpoint
-from forbes.training.run_folder import RunFolder, read_metrics
+from forbes.runs.checkpoint import read_checkpoint
+from forbes.runs.folder import RunFolder, read_metrics
 
 __all__ = [
     "Scenario",

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-from forbes.cli import main
+from forbes.commands.cli import main
 
 __all__ = ["LIMIT", "Ending", "Fault", "changed_file", "left_over", "run", "run_real"]
 

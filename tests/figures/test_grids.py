@@ -8,8 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from forbes.data.pictures import draw_strips, to_rgb
 from forbes.errors import ForbesError
+from forbes.figures.episodes import draw_strips, to_rgb
 from forbes.figures.grids import Panel, draw_panels, require_images
 from forbes.figures.imagination import imagined_futures, open_loop
 from forbes.figures.video import gif

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.colors import to_hex
 from small_agents import fit, write_config
 
-from forbes.cli import main
+from forbes.commands.cli import main
 from forbes.errors import ForbesError
 from forbes.figures.returns import returns_against_env_steps
 from forbes.figures.style import BLUE, ORANGE

@@ -11,15 +11,15 @@ import pytest
 import torch
 from PIL import Image
 
-from forbes.cli import main
+from forbes.commands.cli import main
+from forbes.commands.figures import group
 from forbes.data import SequenceDataModule, Strokes
-from forbes.data.stroke_file import StrokeArrays, save_strokes
+from forbes.data.strokes.file import StrokeArrays, save_strokes
 from forbes.evaluation.runs import load_runs
-from forbes.figures.commands import group
 from forbes.figures.grids import Panel, draw_panels
 from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates
 from forbes.figures.style import BLACK, BLUE, ORANGE, paper_style, save_figure
-from forbes.training.run_folder import read_metrics
+from forbes.runs.folder import read_metrics
 
 RSSM = ["--model.init_args.belief", "GaussianBelief"]
 

@@ -9,7 +9,7 @@ from small_models import BATCH, HIDDEN, TIME, random_model, sequences
 from forbes.beliefs import GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.evaluation.bounds import score_predictions
+from forbes.evaluation.scores import score_predictions
 from forbes.models import MLPDecoder, MLPEncoder, OneHot, VectorModel, elbo_loss
 
 

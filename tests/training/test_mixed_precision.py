@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
-from forbes.cli import main
+from forbes.commands.cli import main
 from forbes.data import SequenceBatch
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ParticleModel, StateSpaceModel, VectorModel
 from forbes.pomdps import LinearGaussian
+from forbes.runs.folder import read_metrics
 from forbes.training import ImaginationActorCritic, KnownBelief, WorldModel
-from forbes.training.run_folder import read_metrics
 
 BATCH, TIME, SHAPE = 3, 4, (1, 6, 6)
 FLOW = partial(FlowBelief, layers=2, width=4)

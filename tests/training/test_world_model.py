@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
 from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief
-from forbes.cli import main
+from forbes.commands.cli import main
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.models import (

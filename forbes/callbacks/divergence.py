@@ -1,0 +1,101 @@
+"""A training stops before the first update that is not finite, and keeps all that was finite before."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
+
+from forbes.data import SequenceDataModule
+from forbes.runs.checkpoint import AtomicCheckpointIO
+from forbes.runs.folder import RunFolder
+from forbes.training.divergence import DivergedError, hold_unless_finite
+
+__all__ = ["StopAtDivergence"]
+
+
+class StopAtDivergence(Callback):
+    """Stops a training whose optimiser is held, and refuses checkpoints with parameters that are not finite.
+
+    On a CPU that is right after the update; on a GPU once in each interval of the logger, which waits for the device
+    anyway, and before each checkpoint. `failure.pt` in the run folder has what repeats the update: the weights and the
+    optimiser before it, its batches, and the seed of its noise (`forbes replay`).
+
+    Args:
+        run: where `failure.pt` goes.
+
+    Raises:
+        DivergedError: with the number of the update.
+    """
+
+    def __init__(self, run: RunFolder) -> None:
+        self.run = run
+
+    def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:
+        """Hold the optimiser if the loss is not finite; the module does so for its gradient."""
+        for optimizer in trainer.optimizers:
+            hold_unless_finite(optimizer, loss, trainer.global_step)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: object, batch_idx: int
+    ) -> None:
+        """Stop, if a look at the device costs nothing now."""
+        interval = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if pl_module.device.type == "cpu" or (interval and trainer.global_step % interval == 0):
+            self._stop_if_held(trainer, pl_module)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Stop before the checkpoint."""
+        self._stop_if_held(trainer, pl_module)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Write nothing that a training could not go on from."""
+        self._stop_if_held(trainer, pl_module)
+        for name, parameter in pl_module.named_parameters():
+            if not parameter.isfinite().all():
+                raise DivergedError(
+                    f"{self.run}: {name} is not finite after update {trainer.global_step}, so no checkpoint is "
+                    "written; the one before it is untouched. Go on from there with a lower learning rate",
+                    trainer.global_step,
+                )
+
+    def _stop_if_held(self, trainer: Trainer, module: LightningModule) -> None:
+        held = min((float(vars(each).get("held_from", math.inf)) for each in trainer.optimizers), default=math.inf)
+        if math.isinf(held):
+            return
+        update = int(held)
+        AtomicCheckpointIO().save_checkpoint(_what_repeats(trainer, module, update), self.run.failure)
+        there = f"forbes fit --resume {self.run}" if self.run.checkpoint.exists() else "the same command"
+        raise DivergedError(
+            f"{self.run}: diverged, the loss or gradient of update {update + 1} is not finite. See where: "
+            f"forbes replay {self.run.failure}. Give a lower --model.learning_rate to {there}",
+            update + 1,
+        )
+
+
+def _what_repeats(trainer: Trainer, module: LightningModule, update: int) -> dict[str, Any]:
+    """Return plain values and tensors from which an update can be computed again; the weights are those before it."""
+    data: SequenceDataModule = trainer.datamodule  # type: ignore[attr-defined]
+    numbers = _batches_of(update, int(trainer.num_training_batches), trainer.accumulate_grad_batches)
+    drawn: Sequence[int] = numbers
+    if trainer.overfit_batches:  # type: ignore[attr-defined]  # all epochs share theirs
+        drawn = [number % int(trainer.num_training_batches) for number in numbers]
+    return {
+        "update": update,
+        "seed": getattr(module, "seed", None),
+        "device": module.device.type,
+        "precision": trainer.precision,
+        "state_dict": module.state_dict(),
+        "optimizer_states": [optimizer.state_dict() for optimizer in trainer.optimizers],
+        "batch_numbers": [*numbers],
+        "batches": [data.sequences("train", data.train_index(number))._asdict() for number in drawn],
+    }
+
+
+def _batches_of(update: int, an_epoch: int, an_update: int) -> range:
+    """Return the numbers of the batches of an update; the last update of an epoch may have fewer than the others."""
+    epoch, place = divmod(update, -(-an_epoch // an_update))
+    first = place * an_update
+    return range(epoch * an_epoch + first, epoch * an_epoch + min(first + an_update, an_epoch))

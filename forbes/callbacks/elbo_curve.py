@@ -1,0 +1,89 @@
+"""The bound and its parts while the model learns."""
+
+import pandas as pd
+import torch
+from lightning import Trainer
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from forbes.callbacks.picture import PictureCallback, to_device
+from forbes.data import SequenceDataModule
+from forbes.evaluation.references import reference_means
+from forbes.figures.style import BLACK, BLUE, GREY, PAGE, draw_references, paper_style, show_settled
+from forbes.runs.folder import read_metrics
+from forbes.training.world_model import WorldModel
+
+__all__ = ["ElboCurve"]
+
+_TITLES = {"kl": "KL", "overshoot": "loss of the roll-out"}
+
+
+class ElboCurve(PictureCallback):
+    """Draws `figures/elbo.png`: the bound and its parts of both splits against updates, and the KL at each step.
+
+    A model without a KL has the loss of its roll-out instead. Dotted is what models without a belief have on the same
+    sequences (`forbes.evaluation.references`). It reads `metrics.jsonl`, so a resumed run shows its
+    whole life.
+
+    Args:
+        sequences: of the validation split, for the KL at each step.
+        every: draw after every k-th epoch.
+    """
+
+    filename = "elbo.png"
+
+    def __init__(self, sequences: int = 200, every: int = 5) -> None:
+        super().__init__(every)
+        self.sequences = sequences
+
+    def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
+        """See `PictureCallback`."""
+        metrics = read_metrics(str(trainer.log_dir))
+        names = [module.objective_name, *module.model.parts]
+        has_kl = "kl" in names
+        with paper_style():
+            figure = Figure((PAGE, 4.2 if has_kl else 2.3), layout="constrained")
+            axes = figure.subplots(2 if has_kl else 1, 2).flat
+            for panel, name in zip(axes, names, strict=False):
+                _draw_curves(panel, metrics, name)
+                unit = "step" if name == "overshoot" else "sequence"
+                panel.set(title=_TITLES.get(name, name), xlabel="updates", ylabel=f"nats per {unit}")
+            if has_kl:
+                _draw_steps(axes[3], *self._kl_per_step(module, data))
+            draw_references(axes[0], self._references(module, data))
+            axes[0].legend()
+        return figure
+
+    def _references(self, module: WorldModel, data: SequenceDataModule) -> dict[str, float]:
+        """Return the means of the references over the sequences of a validation."""
+        count = min(data.validation_sequences, data.source.size("validation"))
+        return reference_means(data, module.model.likelihood, "validation", count)
+
+    def _kl_per_step(self, module: WorldModel, data: SequenceDataModule) -> tuple[Tensor, Tensor]:
+        """Average the KL over sequences, each step on its own: mean and standard error, each `(T,)`."""
+        index = torch.arange(min(self.sequences, data.source.size("validation")))
+        batches = [to_device(data.sequences("validation", part), module) for part in index.split(data.batch_size)]
+        terms = [module.terms(batch) for batch in batches]
+        kl = torch.cat([term.kl.masked_fill(~term.mask, torch.nan) for term in terms]).cpu()  # (B, T)
+        count = kl.isfinite().sum(0)
+        spread = (kl - kl.nanmean(0)).square().nansum(0).div((count - 1).clamp(min=1)).sqrt()
+        return kl.nanmean(0), spread / count.sqrt()  # (T,), (T,)
+
+
+def _draw_curves(axes: Axes, metrics: pd.DataFrame, name: str) -> None:
+    """Draw one metric of both splits."""
+    curves = []
+    for split, label, colour in [("train", "train", GREY), ("val", "validation", BLUE)]:
+        if f"{split}/{name}" in metrics:
+            curves.append(metrics[f"{split}/{name}"].dropna())
+            axes.plot(curves[-1].index, curves[-1], color=colour, label=label)
+    show_settled(axes, curves)
+
+
+def _draw_steps(axes: Axes, mean: Tensor, error: Tensor) -> None:
+    time = range(1, len(mean) + 1)
+    axes.fill_between(time, (mean - error).numpy(), (mean + error).numpy(), color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(time, mean.numpy(), color=BLUE)
+    axes.axhline(0, color=BLACK, linewidth=0.5)
+    axes.set(title="KL at each step, validation", xlabel="t", ylabel="nats")

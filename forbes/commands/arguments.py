@@ -1,0 +1,39 @@
+"""Arguments of the commands that Lightning does not parse: what is wrong with them is said in one sentence."""
+
+import argparse
+from typing import NoReturn
+
+from forbes.choices import LONGEST
+from forbes.errors import ForbesError
+
+__all__ = ["ArgumentParser", "positive", "seconds"]
+
+
+class ArgumentParser(argparse.ArgumentParser):
+    """An `argparse.ArgumentParser` that keeps line breaks in its help and raises `ForbesError`."""
+
+    def __init__(self, prog: str, description: str, epilog: str | None = None) -> None:
+        raw = argparse.RawDescriptionHelpFormatter
+        super().__init__(prog, description=description, epilog=epilog, formatter_class=raw)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise instead of printing the usage and leaving."""
+        raise ForbesError(f"{self.prog}: {message}. See {self.prog} --help")
+
+
+def positive(text: str) -> int:
+    """Parse a number that counts something; for `type=`."""
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
+    return int(text)
+
+
+def seconds(text: str) -> float:
+    """Parse how long to wait; for `type=`."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value <= LONGEST:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of seconds above 0, at most {LONGEST}")
+    return value

@@ -1,0 +1,164 @@
+"""The command `forbes`: lists what there is, hands over to the command asked for, and prints errors as one sentence."""
+
+import argparse
+import difflib
+import importlib
+import itertools
+import sys
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from forbes import __version__
+from forbes.commands.parsers.fit import DESCRIPTION, help_page
+from forbes.errors import FULL, ForbesError, unwritable
+
+__all__ = ["main"]
+
+
+class Command(NamedTuple):
+    """What a command does, how one calls it, and the function that runs it: `module:function(arguments)`."""
+
+    summary: str
+    example: str
+    target: str
+
+
+_TRAINED = "--config RUN/config.yaml --ckpt_path RUN/checkpoints/last.ckpt"
+COMMANDS = {
+    "fit": Command("train a model", "--config configs/strokes/forbes.yaml", "forbes.commands.fit:fit"),
+    "validate": Command("run the validation loop of a model", _TRAINED, "forbes.commands.fit:validate"),
+    "test": Command("run the test loop of a model", _TRAINED, "forbes.commands.fit:test"),
+    "predict": Command("run the prediction loop of a model", _TRAINED, "forbes.commands.fit:predict"),
+    "replay": Command("show where a training has diverged", "RUN/failure.pt", "forbes.commands.replay:main"),
+    "evaluate": Command("measure trained models and compare them", "RUN RUN", "forbes.commands.evaluate:main"),
+    "rollout": Command("film an agent", "RUN --video agent.gif", "forbes.commands.rollout:main"),
+    "beliefs": Command("compare learned beliefs with exact ones", "RUN RUN", "forbes.commands.beliefs:main"),
+    "theorem": Command("check Theorem 1 in closed form", "--steps 30", "forbes.commands.theorem:main"),
+    "compare": Command(
+        "train and measure configurations alike",
+        "configs/strokes/rssm.yaml configs/strokes/forbes.yaml --seeds 3",
+        "forbes.commands.compare:main",
+    ),
+    "calibrate": Command("check a filter against its own model", "RUN -o figures", "forbes.commands.calibrate:main"),
+    "completions": Command(
+        "measure how precise and diverse predicted digits are",
+        "RUN RUN -o figures",
+        "forbes.commands.completions:main",
+    ),
+    "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.commands.figures:main"),
+    "data": Command(
+        "fetch, build, collect and look at data", "show strokes -o strokes.png", "forbes.commands.parsers.data:main"
+    ),
+    "doctor": Command("say what this machine has and lacks", "", "forbes.commands.doctor:main"),
+}
+
+HELP = """\
+usage: forbes COMMAND ...
+
+Learn, measure and use belief states of partially observable processes.
+
+commands, each with an example (RUN is a folder that `forbes fit` has made):
+{commands}
+options:
+  --help               this page; after a command, its own
+  --version            the version
+  --debug              with any command: show the traceback of an error
+  --allow-module NAME  with any command: let configurations name classes of this Python module too
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status.
+
+    That is 0, 2 for an error the user can mend, 3 for a training that diverged, 130 or 143 for a signal.
+
+    Args:
+        arguments: without the program's name; those of the process by default.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in arguments
+    try:
+        return _run([argument for argument in arguments if argument != "--debug"])
+    except (ForbesError, OSError) as error:
+        if debug:
+            raise
+        print(f"forbes: {_sentence(error)}", file=sys.stderr)
+        return error.exit_status if isinstance(error, ForbesError) else 2
+    except (KeyboardInterrupt, SystemExit) as error:
+        interrupt = error if isinstance(error, KeyboardInterrupt) else error.__context__  # Lightning exits with 1
+        if debug or not isinstance(interrupt, KeyboardInterrupt):
+            raise
+        return 130
+
+
+def _run(arguments: list[str]) -> int:
+    """Answer --help and --version, or hand over."""
+    modules = _take_modules(arguments)
+    if not arguments or arguments[0] in ("--help", "-h", "help"):
+        print(_help(), end="")
+        return 0
+    if arguments[0] == "--version":
+        print(f"forbes {__version__}")
+        return 0
+    if arguments[0] not in COMMANDS:
+        near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
+        hint = f"Did you mean {near[0]}?" if near else f"There are {', '.join(COMMANDS)}"
+        raise ForbesError(f"{arguments[0]}: no such command. {hint}")
+    if modules:
+        importlib.import_module("forbes.runs.configuration").allow_modules(modules)
+    name, *rest = arguments
+    if name in DESCRIPTION:
+        if (page := _asked_help(name, rest)) is not None:
+            print(page, end="")
+            return 0
+    else:  # help and mistakes are told before anything heavy is imported
+        _parser(name).parse_args(list(itertools.takewhile("--".__ne__, rest)))
+    module, function = COMMANDS[name].target.split(":")
+    command: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
+    return command(rest) or 0
+
+
+def _asked_help(name: str, arguments: list[str]) -> str | None:
+    """Return the help of a command that Lightning parses, if it is asked for; remove `all`, which asks Lightning."""
+    place = next((place for place, argument in enumerate(arguments) if argument in ("--help", "-h")), None)
+    if place is None:
+        return None
+    if arguments[place + 1 : place + 2] == ["all"]:
+        del arguments[place + 1]
+        return None
+    return help_page(name)
+
+
+def _parser(name: str) -> argparse.ArgumentParser:
+    """Return the parser of another command, of the module of its name."""
+    parser: argparse.ArgumentParser = importlib.import_module(f"forbes.commands.parsers.{name}").parser()
+    return parser
+
+
+def _take_modules(arguments: list[str]) -> list[str]:
+    """Remove each `--allow-module NAME` from the arguments and give the names."""
+    modules = []
+    while "--allow-module" in arguments:
+        place = arguments.index("--allow-module")
+        if place + 1 == len(arguments):
+            raise ForbesError("--allow-module: no name follows. Name a Python module")
+        modules.append(arguments[place + 1])
+        del arguments[place : place + 2]
+    return modules
+
+
+def _help() -> str:
+    """List the commands."""
+    rows = []
+    for name, command in COMMANDS.items():
+        rows += [f"  {name:<11} {command.summary}", f"              forbes {name} {command.example}".rstrip(), ""]
+    return HELP.format(commands="\n".join(rows))
+
+
+def _sentence(error: Exception) -> str:
+    """Say a missing file, a full disk and the like as shortly as our own errors."""
+    if isinstance(error, OSError) and error.errno in FULL:
+        return str(unwritable(error.filename or "the output", error))
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {(error.strerror or type(error).__name__).lower()}"
+    return str(error)

@@ -1,0 +1,66 @@
+"""`forbes data collect`: episodes that a random policy plays, or an agent that has learned."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.progress import track
+
+from forbes.commands.episodes import count_steps
+from forbes.data.episodes.collection import MakePolicy, collect_episodes, random_policy
+from forbes.data.episodes.episode import EpisodeRecord
+from forbes.data.episodes.store import EpisodeWriter
+from forbes.envs import Environment, EnvironmentProcess, find_environment
+from forbes.errors import ForbesError
+from forbes.files import require_room
+from forbes.training.acting import Acting
+from forbes.training.loading import loaded_agent
+
+__all__ = ["collect"]
+
+_RANDOM = "random"
+
+
+def collect(output: Path, episodes: int, policy: str, seed: int, **environment: Any) -> None:
+    """Play episodes in a process of its own, and store them; interrupted, it goes on where it stopped.
+
+    Args:
+        output: folder of the store.
+        episodes: how many have been stored in the end, those of earlier calls included.
+        policy: "random", or the run folder of an agent, which explores as in its training.
+        seed: episode n is a function of (seed, n) and the policy.
+        environment: task, options of its constructor, seconds for an answer and most steps; None where it is not said.
+
+    Raises:
+        ForbesError: where there is no such task or run, an agent is given another task, or an episode breaks.
+    """
+    given = {name: value for name, value in environment.items() if value is not None}
+    with _acting(policy, given) as (played_in, make_policy), EpisodeWriter(output) as writer:
+        missing = max(0, episodes - writer.watermark)
+        played = collect_episodes(played_in, writer, make_policy, policy, episodes, seed)
+        records: list[EpisodeRecord] = []
+        for record in track(played, f"Playing {played_in.describe()['task']}", total=missing):
+            if not records:
+                require_room(output, "the episodes to come", (missing - 1) * record.size)
+            records.append(record)
+    print(f"{output}: {len(records)} episodes stored, {count_steps(records)}; {writer.watermark} in all")
+
+
+@contextmanager
+def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, MakePolicy]]:
+    """Return who acts, and where: an agent in the environment of its run."""
+    if policy != _RANDOM:
+        if given:
+            flag = "--" + min(given).replace("_", "-")
+            raise ForbesError(
+                f"--policy {policy}: an agent acts in the environment of its run, expected no {flag}. Leave it out"
+            )
+        with loaded_agent(policy, "cpu") as (agent, environment, _):
+            yield environment, Acting(agent, exploring=True)
+    elif "task" not in given:
+        raise ForbesError(f"--policy {_RANDOM}: needs an environment. Name one: --task TASK")
+    else:
+        limits = {name: given.pop(name) for name in ("timeout", "time_limit") if name in given}
+        with EnvironmentProcess(find_environment(**given), **limits) as environment:
+            yield environment, random_policy

@@ -1,0 +1,102 @@
+"""`forbes completions`: whether predictions of digits are precise yet diverse, in numbers and in pictures."""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+
+from forbes.commands.parsers.completions import parser
+from forbes.data import Strokes
+from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, load_judges
+from forbes.errors import ForbesError
+from forbes.evaluation.digits.completions import prefixes
+from forbes.evaluation.digits.study import Study, entries, print_study, study
+from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
+from forbes.figures.completions import by_ambiguity, drawings, errors, scores
+from forbes.figures.style import save_figure
+from forbes.files import replace_file
+from forbes.runs.provenance import command_line, commit
+
+__all__ = ["main"]
+
+_DRAWN = 10  # digits in a picture
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the command with its arguments."""
+    args = parser().parse_args(argv)
+    runs = load_runs(args.runs)
+    _check(args, runs)
+    data = runs[0].data
+    hashes = [data_sha256(run.data, args.split, args.sequences) for run in runs]
+    require_comparable(runs, hashes)
+    assert isinstance(data.source, Strokes)
+    judges = load_judges(data.source.origin)
+    named = dict(zip(run_titles(runs), runs, strict=True))
+    studies = []
+    for context in sorted(set(args.prefixes)):
+        beginnings = prefixes(data, args.split, args.sequences, context, judges.prefix)
+        studies.append(study(named, judges, beginnings, args.split, args.samples, args.seed))
+        print_study(studies[-1], data.length)
+    record = {
+        "command": command_line("completions", *argv),
+        "commit": commit(),
+        "seed": args.seed,
+        "data": {"name": data_name(data), "sha256": hashes[0]},
+        "classifiers": CLASSIFIERS_SHA256,
+        "runs": [_describe(name, run) for name, run in named.items()],
+    }
+    _write(args, record, studies)
+    _draw(args, runs, studies)
+
+
+def _check(args: Any, runs: Sequence[TrainedRun]) -> None:
+    """Say what does not fit before minutes are spent."""
+    for run in runs:
+        if not isinstance(run.data.source, Strokes):
+            raise ForbesError(f"{run.path}: its data are {data_name(run.data)}, expected Strokes. Name other runs")
+        if args.sequences > (size := run.data.source.size(args.split)):
+            raise ForbesError(
+                f"--sequences {args.sequences}: the {args.split} split of {run.path} has {size}. Choose fewer"
+            )
+        if (longest := max(args.prefixes)) >= run.data.length:
+            raise ForbesError(
+                f"--prefixes {longest}: the sequences of {run.path} have {run.data.length} steps, expected fewer. "
+                "Choose a smaller prefix"
+            )
+    if args.samples < 2:
+        raise ForbesError(f"--samples {args.samples}: expected at least 2, since completions are compared. Choose more")
+
+
+def _describe(name: str, run: TrainedRun) -> dict[str, Any]:
+    return {"row": name, "path": run.path, "parameters": run.parameters, "checkpoint": run.checkpoint}
+
+
+def _write(args: Any, record: dict[str, Any], studies: Sequence[Study]) -> None:
+    """Write every score with its paired differences, and the curves over n."""
+    found = [entry for one in studies for entry in entries(one, f"{args.split}[:{args.sequences}]")]
+    curves = [
+        {"row": row.name, "c": one.prefixes.context, "best": row.best, "average": row.average}
+        for one in studies
+        for row in (*one.runs, one.similar, one.truth)
+    ]
+    content = json.dumps(record | {"scores": found, "curves": curves}, indent=2)
+    replace_file(args.output / "completions.json", f"{content}\n".encode())
+    replace_file(args.output / "completions.csv", pd.DataFrame(found).to_csv(index=False).encode())
+
+
+def _draw(args: Any, runs: Sequence[TrainedRun], studies: Sequence[Study]) -> None:
+    figures = {"completions-scores": scores(studies), "completions-errors": errors(studies)}
+    for one in studies:
+        place = by_ambiguity(one.prefixes.reference, _DRAWN)
+        end = int(one.prefixes.steps[place].max())
+        batch = runs[0].data.sequences(args.split, one.prefixes.digits[place], end)
+        models = [run.model for run in runs]
+        figures[f"completions-c{one.prefixes.context}"] = drawings(
+            one, models, runs[0].data.source, batch, place, args.seed
+        )
+    for name, figure in figures.items():
+        for suffix in (".png", ".pdf"):
+            save_figure(figure, args.output / f"{name}{suffix}")
+    print(f"completions.json, .csv and {', '.join(figures)} are in {args.output}")

@@ -1,0 +1,132 @@
+"""The command `forbes doctor`: what this machine has and lacks, each lack with its remedy."""
+
+import os
+import platform
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from rich.console import Console
+from rich.table import Column, Table
+
+import forbes
+from forbes.commands.parsers.doctor import parser
+from forbes.data.download import curves_path
+from forbes.data.strokes.classifiers import classifiers_path
+from forbes.data.strokes.dejong import dejong_path
+from forbes.data.strokes.source import bundled_path
+from forbes.envs.rendering import BACKENDS, probe_backend
+
+__all__ = ["main"]
+
+_DRIVER_LIMIT = 30.0
+"""Seconds for nvidia-smi, which takes a few where no GPU is awake."""
+REQUIRED = ("torch", "lightning", "jsonargparse", "numpy", "matplotlib", "pandas")
+OPTIONAL = {
+    "scikit-image": "build",
+    "tensorboard": "tracking",
+    "dm-control": "dmc",
+    "mujoco": "dmc",
+    "gymnasium": "gym",
+}
+
+
+class Finding(NamedTuple):
+    """One line of the report."""
+
+    name: str
+    value: str
+    remedy: str = ""
+    """What to do; empty where all is well."""
+    fatal: bool = False
+    """True where `make fit` cannot work."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the report; 0 when `make fit` can work here, else 1."""
+    parser().parse_args(arguments)
+    table = Table("", Column("found", overflow="fold"), Column("what to do", overflow="fold"), box=None)
+    findings = [*_software(), *_hardware(), *_rendering(), *_data()]
+    for finding in findings:
+        table.add_row(finding.name, finding.value, finding.remedy)
+    Console().print(table)
+    return int(any(finding.fatal for finding in findings))
+
+
+def _software() -> Iterator[Finding]:
+    yield Finding("forbes", f"{forbes.__version__}, Python {platform.python_version()}")
+    for name in REQUIRED:
+        yield Finding(name, version(name))
+    for name, extra in OPTIONAL.items():
+        try:
+            yield Finding(name, version(name))
+        except PackageNotFoundError:
+            yield Finding(name, "not installed (optional)", f"pip install 'forbes\\[{extra}]'")
+
+
+def _hardware() -> Iterator[Finding]:
+    threads = torch.get_num_threads()
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    yield Finding(
+        "processors", f"{cpus}, torch uses {threads} threads", "set OMP_NUM_THREADS" if threads > cpus else ""
+    )
+    yield from _gpus()
+    free = shutil.disk_usage(".").free / 2**30
+    yield Finding(
+        "free disk", f"{free:.1f} GiB here", "make room: a run takes up to 0.1 GiB" if free < 1 else "", free < 0.1
+    )
+
+
+def _gpus() -> Iterator[Finding]:
+    """Name every GPU that torch can use, and the driver, which may be there without one."""
+    for number in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(number)
+        yield Finding(f"GPU {number}", f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB")
+    if not torch.cuda.is_available():
+        yield Finding("GPU", "none that torch can use (optional)")
+    if program := shutil.which("nvidia-smi"):
+        remedy = "" if torch.cuda.is_available() else "install torch for CUDA, if there is a GPU (https://pytorch.org)"
+        built = f"torch is built for CUDA {torch.version.cuda or 'none'}"
+        yield Finding("GPU driver", f"{_driver(program)}; {built}", remedy)
+
+
+def _driver(program: str) -> str:
+    """Ask nvidia-smi for its version, which a broken driver lets hang."""
+    asked = [program, "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        answer = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=_DRIVER_LIMIT)
+    except subprocess.TimeoutExpired:
+        return f"nvidia-smi hangs, no answer within {_DRIVER_LIMIT:g} s"
+    return (answer.stdout.strip() or answer.stderr.strip() or "nvidia-smi says nothing").splitlines()[0]
+
+
+def _rendering() -> Iterator[Finding]:
+    """Try every backend, that of MUJOCO_GL first; without dm-control there is nothing to render."""
+    if find_spec("dm_control") is None:
+        return
+    asked = os.environ.get("MUJOCO_GL")
+    if asked:
+        yield Finding("MUJOCO_GL", asked)
+    for backend in dict.fromkeys((asked, *BACKENDS) if asked else BACKENDS):
+        probe = probe_backend(backend)
+        value = probe.problem or f"{probe.renderer}, {probe.frames_per_second:.0f} frames of 64 x 64 a second"
+        yield Finding(f"rendering, {backend}", value, probe.remedy)
+
+
+def _data() -> Iterator[Finding]:
+    package = Path(forbes.__file__).parent
+    shipped = package / "configs" if (package / "configs").is_dir() else package.parent / "configs"
+    yield Finding("configurations", str(shipped))
+    for name, path, remedy, needed in (
+        ("strokes, bundled", bundled_path(), "forbes data build-strokes --images DIR", True),
+        ("digit classifiers", classifiers_path(), "install forbes again, if you need forbes completions", False),
+        ("strokes, de Jong", dejong_path(), "forbes data fetch strokes (optional: the paper's set)", False),
+        ("curves of Dreamer", curves_path(), "forbes data fetch curves (optional: beside an agent's own)", False),
+    ):
+        found = path.is_file()
+        yield Finding(name, str(path) if found else f"no {path}", "" if found else remedy, needed and not found)

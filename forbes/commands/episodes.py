@@ -1,0 +1,92 @@
+"""`forbes data info` and `check`: the episodes of an environment, counted and verified."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from forbes.data.episodes.episode import EpisodeRecord
+from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
+from forbes.figures.episodes import MAX_CHANNELS, draw_strips
+from forbes.figures.style import save_figure
+
+__all__ = ["check", "count_steps", "info"]
+
+
+def info(path: Path, output: Path | None = None) -> None:
+    """Print what a store of episodes holds, and draw the frames of three of them.
+
+    Args:
+        path: folder of the store.
+        output: picture to write, by default `frames.png` in the folder; only images of at most four channels are drawn.
+    """
+    store = EpisodeStore(path)
+    store.require_episodes()
+    records = sorted(store.records.values(), key=lambda record: record.total_reward)
+    for name, value in _facts(store, records):
+        print(f"{name:<22}{value}")
+    shape = records[0].environment["observation_shape"]
+    if len(shape) == 3 and shape[0] <= MAX_CHANNELS:
+        chosen = {record.number: record for record in (records[0], records[len(records) // 2], records[-1])}
+        rows = [(f"episode {n}\nreturn {one.total_reward:.1f}", store.episode(n)) for n, one in chosen.items()]
+        picture = output or path / "frames.png"
+        save_figure(draw_strips(rows), picture)
+        print(picture)
+
+
+def _facts(store: EpisodeStore, records: list[EpisodeRecord]) -> list[tuple[str, str]]:
+    """Say what there is, by name; records in the order of their returns."""
+    returns = np.array([record.total_reward for record in records])
+    facts = [(name, str(value)) for name, value in records[-1].environment.items() if name != "made_by"]
+    made_by = Counter(
+        ", ".join(f"{name} {value}" for name, value in record.environment.get("made_by", {}).items())
+        for record in records
+    )
+    facts += [("made by", f"{text or 'unknown'}: {count} episodes") for text, count in made_by.items()]
+    policies = Counter(record.policy for record in records)
+    facts += [
+        ("policies", ", ".join(f"{name}: {count} episodes" for name, count in policies.items())),
+        (
+            "episodes",
+            f"{len(records)}, of {store.watermark} ever stored; {sum(r.terminated for r in records)} terminated",
+        ),
+        ("steps", count_steps(records)),
+        ("on the disk", f"{sum(record.size for record in records) / 2**20:.1f} MiB"),
+        ("return", _spread(returns)),
+    ]
+    rewards, actions = [], []
+    for episode in map(store.episode, store.records):
+        rewards.append(episode.reward[1:].copy())  # a view would keep the file open
+        actions.append(episode.action[1:].copy())
+    facts.append(("reward of a step", _spread(np.concatenate(rewards))))
+    columns = np.concatenate(actions).T  # (A, steps)
+    return facts + [(f"action {place}", _spread(column)) for place, column in enumerate(columns)]
+
+
+def check(path: Path) -> int:
+    """Verify every file of a store of episodes, and put damaged ones aside; 1 if there were any.
+
+    Args:
+        path: folder of the store.
+    """
+    store = EpisodeStore(path)
+    if not store.files():  # else a lost index can be rebuilt
+        store.require_episodes()
+    with EpisodeWriter(path) as writer:
+        count, damage = len(writer.records), writer.damage()
+        for number, reason in damage.items():
+            writer.quarantine(number)
+            print(f"{writer.file(number)}: damaged ({reason}), moved to {path / 'quarantine'}")
+    print(f"{path}: {count} episodes read, {count - len(damage)} whole, {len(damage)} damaged")
+    return int(bool(damage))
+
+
+def count_steps(records: list[EpisodeRecord]) -> str:
+    """Keep the two kinds of steps apart."""
+    steps, frames = sum(record.steps for record in records), sum(record.frames for record in records)
+    return f"{steps:,} agent steps, {frames:,} env steps (frames, with action repeat)"
+
+
+def _spread(values: Any) -> str:
+    return f"{values.min():.3f} to {values.max():.3f}, mean {values.mean():.3f}"

@@ -1,0 +1,233 @@
+"""`forbes evaluate`: bounds and proper scores of trained models, and the paired difference of each two."""
+
+import itertools
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from forbes.choices import PASSES, SUBSET, Split
+from forbes.commands.evaluate_agents import print_agents
+from forbes.commands.parsers.evaluate import parser
+from forbes.commands.tables import print_degradation, print_pairs, print_references, print_runs
+from forbes.data import Simulated
+from forbes.errors import ForbesError
+from forbes.evaluation.agents import evaluate_agents, is_agent
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.metrics import SCORES, Measured, note, pair
+from forbes.evaluation.record import describe, require_readable, results_folders, write_record
+from forbes.evaluation.references import references
+from forbes.evaluation.round_trip import model_round_trip, print_round_trip
+from forbes.evaluation.runs import (
+    TrainedRun,
+    data_name,
+    data_sha256,
+    find_device,
+    load_runs,
+    require_comparable,
+    split_batches,
+)
+from forbes.evaluation.scoring import Parts, Pass, exact_pass, make_pass, score_split, with_progress
+from forbes.runs.provenance import command_line, commit
+
+__all__ = ["evaluate", "main", "wanted_metrics"]
+
+
+class _Job(NamedTuple):
+    """A pass over the first so many sequences of a split."""
+
+    name: str
+    score: Pass
+    sequences: int
+    sha256: list[str]
+    """Of the sequences, as each run's data give them."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the command with its arguments."""
+    args = parser().parse_args(argv)
+    command = command_line("evaluate", *argv)
+    if args.checkpoint is not None:
+        args.runs = [str(Path(run) / "checkpoints" / args.checkpoint) for run in args.runs]
+    folders = results_folders(args.runs, args.output)
+    if is_agent(args.runs[0]):
+        device = find_device(args.device)
+        played = evaluate_agents(folders, args.episodes, args.acting_samples, args.seed, device, command)
+        return print_agents(played)
+    measured = evaluate(args.runs, args, command, folders)
+    print_runs(measured)
+    print_references(measured)
+    if len(measured) > 1:
+        print_pairs(pair(measured))
+    print_degradation(measured)
+
+
+def evaluate(
+    paths: Sequence[str], args: Any, command: str, folders: Mapping[str, Path] | None = None
+) -> list[Measured]:
+    """Measure runs on the same sequences and record it.
+
+    Args:
+        paths: run folders.
+        args: with the options of `forbes.commands.parsers.evaluate.add_score_options`.
+        command: for the record.
+        folders: where the record of each run goes; into the run by default.
+    """
+    folders = folders or results_folders(paths)
+    require_readable(folders.values())
+    runs = load_runs(paths, find_device(args.device))
+    jobs = _jobs(args, runs)
+    finished: list[Parts] = []
+    measured = []
+    for number, run in enumerate(runs):
+        one = Measured(run, {}, {})
+        for job in _of(run, jobs):
+            finished.append(_measure(one, job, job.sha256[number], args, folders[run.path]))
+        _add_references(one, jobs, args.split)
+        for entry in one.entries.values():
+            date = datetime.now(UTC).isoformat(timespec="seconds")
+            entry.update(command=command, commit=commit(), seed=args.seed, date=date, parameters=run.parameters)
+        measured.append(one)
+    for first, second, differences in pair(measured):
+        note(first, second, differences)
+    for one in measured:
+        write_record(folders[one.run.path], one.entries | _round_trip(one.run, args), one.totals)
+    for parts in finished:
+        parts.remove()
+    return measured
+
+
+def _add_references(one: Measured, jobs: Sequence[_Job], split: Split) -> None:
+    """Put beside each score what references have on the same steps of the same sequences."""
+    found: dict[int, dict[str, Tensor]] = {}
+    for job in _of(one.run, jobs):
+        scores = [metric for metric in job.score.metrics if metric in SCORES]
+        if scores and job.sequences not in found:
+            found[job.sequences] = references(one.run.data, one.run.model.likelihood, split, job.sequences)
+        for metric in scores:
+            one.entries[_metric_name(one.run, job, metric, split)]["references"] = {
+                name: Estimate.of(values[:, job.score.context :].sum(1))._asdict()
+                for name, values in found[job.sequences].items()
+            }
+
+
+def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[dict[str, bool]]:
+    """Name the metrics that `evaluate` measures runs by, and tell for each run whether its model has them."""
+    jobs = _jobs(args, runs)
+    return [
+        {
+            _metric_name(run, job, metric, args.split): metric in job.score.of(run.model).metrics
+            for job in jobs
+            for metric in job.score.metrics
+        }
+        for run in runs
+    ]
+
+
+def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
+    """Say which passes to make, on how many sequences; refuse runs that cannot be compared there."""
+    numbers = {name: getattr(args, option) for name, option in PASSES.items()}
+    wanted = {
+        name: make_pass(name, numbers[name], args.batch_size, args.context) for name in PASSES if name in args.scores
+    }
+    if not any(score.of(run.model).metrics for run in runs for score in wanted.values()):
+        raise ForbesError(
+            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(wanted)} score, its likelihood is exact. "
+            "Ask for --scores pll or open-loop"
+        )
+    for run, name in itertools.product(runs, [name for name in ("pll", "open-loop") if name in wanted]):
+        run.model.draws(numbers[name])  # a number that cannot be is said before minutes are spent
+    if isinstance(source := runs[0].data.source, Simulated):
+        wanted = {"exact": exact_pass(source.process)} | wanted
+    hashes: dict[int, list[str]] = {}
+    jobs = []
+    for name, score in wanted.items():
+        count = _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else SUBSET)
+        if count not in hashes:
+            for run in runs:
+                _count(run, args, count)
+            hashes[count] = [data_sha256(run.data, args.split, count) for run in runs]
+            require_comparable(runs, hashes[count])
+        jobs.append(_Job(name, score, count, hashes[count]))
+        if name == "open-loop":
+            _require_longer(runs[0], args, count)
+    return jobs
+
+
+def _require_longer(run: TrainedRun, args: Any, count: int) -> None:
+    """Refuse sequences that end within the context: nothing of them would be left to score."""
+    for first, batch in split_batches(run.data, args.split, count, batch_size=500):
+        length = batch.mask.sum(1)  # (B,)
+        if (length <= args.context).any():
+            place = int(length.argmin())
+            raise ForbesError(
+                f"--context {args.context}: sequence {first + place} of the {args.split} split of {run.path} has "
+                f"{length[place]} steps, expected more. Choose a smaller context, or name other --scores"
+            )
+
+
+def _of(run: TrainedRun, jobs: Sequence[_Job]) -> list[_Job]:
+    """Leave out the scores that the run's model does not have."""
+    each = [job._replace(score=job.score.of(run.model)) for job in jobs]
+    return [job for job in each if job.score.metrics]
+
+
+def _count(run: TrainedRun, args: Any, default: int) -> int:
+    """Return the number of sequences to score."""
+    size = run.data.source.size(args.split)
+    wanted = min(default, size) if args.sequences is None else args.sequences
+    if sys.maxsize > wanted > size:
+        raise ForbesError(
+            f"--sequences {wanted}: the {args.split} split of {run.path} has {size} sequences. Choose fewer"
+        )
+    if (count := min(wanted, size)) < 2:
+        where = f"the {args.split} split of {run.path}" if size < 2 else f"--sequences {count}"
+        raise ForbesError(f"{where}: a standard error needs at least 2 sequences, found {count}. Choose more")
+    return count
+
+
+def _round_trip(run: TrainedRun, args: Any) -> dict[str, dict[str, Any]]:
+    """Measure, print and name how well its flows are inverted on the first batch of the split; {} of other families."""
+    _, batch = next(split_batches(run.data, args.split, _count(run, args, args.batch_size), args.batch_size))
+    found = model_round_trip(run.model, batch, args.seed)
+    print_round_trip(run.path, found)
+    return (
+        {
+            f"{args.split}/round_trip": found
+            | {"sequences": len(batch.mask), "seed": args.seed, "checkpoint": run.checkpoint}
+        }
+        if found
+        else {}
+    )
+
+
+def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
+    """Name a metric in full: `test[:1000]/pll[bernoulli,K=128]`."""
+    whole = job.sequences == run.data.source.size(split)  # type: ignore[arg-type]  # argparse has checked it
+    part = "" if whole else f"[:{job.sequences}]"
+    tag = job.score.tag if job.name == "exact" else f"{run.model.likelihood.name},{job.score.tag}"
+    return f"{split}{part}/{metric}[{tag}]"
+
+
+def _measure(one: Measured, job: _Job, sha256: str, args: Any, folder: Path) -> Parts:
+    """Make a pass for a run and add what it finds; give the parts it has left, to be removed in the end."""
+    run, score = one.run, job.score
+    parts = Parts(folder / "evaluation-parts", run.checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed)
+    began = time.monotonic()
+    batches = split_batches(run.data, args.split, job.sequences, score.batch_size)
+    batches = with_progress(batches, f"{run.path} {job.name}", job.sequences)
+    scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts)
+    for metric in score.metrics:
+        name = _metric_name(run, job, metric, args.split)
+        one.totals[name] = scores.total(metric)
+        one.entries[name] = describe(scores, metric) | {
+            "data": {"name": data_name(run.data), "sha256": sha256},
+            "checkpoint": run.checkpoint,
+            "device": str(next(run.model.parameters()).device),
+            "seconds": round(time.monotonic() - began, 1),
+        }
+    return parts

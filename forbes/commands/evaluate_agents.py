@@ -1,0 +1,58 @@
+"""What `forbes evaluate` prints of agents."""
+
+import itertools
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from forbes.evaluation.agents import DISTANCES, REWARD, PlayedAgent
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.reward_prediction import STEPS_AHEAD
+
+__all__ = ["print_agents"]
+
+
+def print_agents(played: Sequence[PlayedAgent]) -> None:
+    """Print the returns, the reward predictions, the beliefs, and the difference of each two agents."""
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    episodes, how = len(played[0].returns), "undiscounted, mean ± standard error; the same episodes for all"
+    table = Table(title=f"return in {episodes} episodes, by the mean action of K trajectories of the belief: {how}")
+    for header in ("run", "agent", "parameters", "K", "return", "lowest", "highest"):
+        table.add_column(header, overflow="fold", justify="left" if header in ("run", "agent") else "right")
+    for one in played:
+        size = sum(parameter.numel() for parameter in one.agent.parameters())
+        ends = (f"{end.item():.1f}" for end in (one.returns.min(), one.returns.max()))
+        kind = f"{type(one.agent).__name__}, {type(one.agent.model.posterior).__name__}"
+        samples = str(one.agent.acting_samples)
+        table.add_row(escape(one.run), kind, f"{size:,}", samples, str(Estimate.of(one.returns)), *ends)
+    console.print(table)
+    console.print(_foresight(played))
+    if any(one.belief for one in played):
+        console.print(_beliefs(played))
+    for first, second in itertools.combinations(played, 2):
+        difference = Estimate.of(first.returns - second.returns)
+        console.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
+
+
+def _foresight(played: Sequence[PlayedAgent]) -> Table:
+    title = "share of the rewards' variance in these episodes that the world model foretells, by the actions taken"
+    table = Table("run", title=f"{title}; 0 is as good as the mean reward")
+    for distance in STEPS_AHEAD:
+        table.add_column(f"{distance} steps ahead" if distance else "when seen", justify="right")
+    for one in played:
+        table.add_row(escape(one.run), *("n/a" if share is None else str(share) for share in one.explained))
+    return table
+
+
+def _beliefs(played: Sequence[PlayedAgent]) -> Table:
+    table = Table("run", title="the belief: its KL from the nearest Gaussian; how unsure it is of a reward it has met")
+    for column in ("prior, nats a step", "posterior, nats a step", "variance of the reward / exact belief's"):
+        table.add_column(column, justify="right")
+    for one in played:
+        *distances, reward = (one.belief.get(metric) for metric in (*DISTANCES, REWARD))
+        nats = ("n/a" if each is None else f"{each.mean:z.3f} ± {each.standard_error:.3f}" for each in distances)
+        table.add_row(escape(one.run), *nats, "n/a" if reward is None else str(reward))
+    return table

@@ -1,0 +1,152 @@
+"""`forbes replay`: computes an update that was not finite again, and names the first tensor that is not."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from lightning import LightningModule
+from torch import Tensor, nn
+
+from forbes.commands.parsers.replay import parser
+from forbes.data import SequenceBatch
+from forbes.data.source import check_batch
+from forbes.errors import ForbesError
+from forbes.runs.checkpoint import read_checkpoint
+from forbes.runs.configuration import allow_modules
+from forbes.runs.folder import RunFolder
+from forbes.runs.modules import build_run, check_weights
+from forbes.training.known_belief import KnownBelief
+from forbes.training.world_model import WorldModel
+
+__all__ = ["first_not_finite", "main"]
+
+_FIELDS = {"update": int, "seed": int, "device": str, "precision": str}
+_FIELDS |= {"state_dict": Mapping, "batch_numbers": list, "batches": list}
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the command with its arguments.
+
+    Raises:
+        ForbesError: where the file is not what a divergence leaves, or the update is finite now.
+    """
+    path = parser().parse_args(argv).failure
+    if not path.is_file():
+        raise ForbesError(f"{path}: no such file. Name the failure.pt in the folder of a run that diverged")
+    failure = read_checkpoint(path)
+    if problem := _problem_of(failure):
+        raise ForbesError(f"{path}: {problem}, expected the failure.pt of a run that diverged. Name one")
+    allow_modules()
+    module, data, _ = build_run(RunFolder(path.parent))
+    if not isinstance(module, WorldModel | KnownBelief):
+        name = type(module).__name__
+        raise ForbesError(f"{path}: of a {name}, expected a WorldModel or a KnownBelief. Compute its loss in Python")
+    check_weights(module, failure["state_dict"], str(path))
+    for batch in failure["batches"]:
+        check_batch(data.source, SequenceBatch(**batch))
+    device = failure["device"] if torch.cuda.is_available() else "cpu"
+    found = first_not_finite(module, failure, device)
+    update = f"{path}: update {failure['update'] + 1}, computed again on {device}"
+    if found is None:
+        raise ForbesError(
+            f"{update}, is finite; it was not on {failure['device']}. Replay it there, with the version and the "
+            "config.yaml of the training"
+        )
+    print(f"{update}: the first tensor that is not finite is {found}")
+
+
+def first_not_finite(module: WorldModel | KnownBelief, failure: Mapping[str, Any], device: str = "cpu") -> str | None:
+    """Compute an update again and describe its first tensor that is not finite; None where all are.
+
+    Args:
+        module: of the run's configuration; gets the weights before the update.
+        failure: content of `failure.pt`.
+        device: to compute on.
+    """
+    module.load_state_dict(failure["state_dict"])
+    module.to(device).train()
+    watch = _Watch(module)
+    for number, content in zip(failure["batch_numbers"], failure["batches"], strict=True):
+        batch = SequenceBatch(**content)
+        for name, values in batch._asdict().items():
+            watch.look(f"{name} of batch {number}", values)
+        batch = SequenceBatch(*(values.to(device) for values in batch))
+        _stand_before(module, failure["update"], number)
+        module.on_train_batch_start(batch, batch_idx=1)  # seeds the noise; 0 would check the data of an epoch
+        with torch.autocast(device, torch.bfloat16, enabled=failure["precision"].startswith("bf16")):
+            loss, terms = module.losses(batch) if isinstance(module, WorldModel) else (module.loss(batch), {})
+        for name, values in terms.items():
+            watch.look(f"the loss term {name}", values)
+        watch.look("the loss", loss)
+        if watch.found:
+            break
+        loss.backward()
+    gradients = [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
+    watch.look("the norm of all gradients", torch.nn.utils.get_total_norm(gradients))
+    return next(iter(watch.found), None)
+
+
+class _Watch:
+    """Notes what is not finite, in the order in which an update computes it.
+
+    Args:
+        module: whose parameters, outputs of modules within and gradients are looked at.
+    """
+
+    def __init__(self, module: LightningModule) -> None:
+        self.found: list[str] = []
+        for name, values in module.state_dict().items():
+            self.look(f"the parameter {name}", values)
+        for name, part in module.named_modules():
+            part.register_forward_hook(partial(self._after, name))
+        for name, parameter in module.named_parameters():
+            parameter.register_post_accumulate_grad_hook(partial(self._accumulated, name))
+
+    def look(self, name: str, values: Any) -> None:
+        """Note the tensors in `values` that are not finite."""
+        for tensor in _tensors(values):
+            if broken := int((~tensor.isfinite()).sum()):
+                self.found.append(f"{name}: {broken} of {tensor.numel()} values, shape {tuple(tensor.shape)}")
+
+    def _after(self, name: str, part: nn.Module, inputs: Any, output: Any) -> None:
+        self.look(f"the output of {name} ({type(part).__name__})", output)
+
+    def _accumulated(self, name: str, parameter: Tensor) -> None:
+        self.look(f"the gradient of {name}", parameter.grad)
+
+
+def _tensors(values: Any) -> Iterator[Tensor]:
+    """Yield the tensors in nested tuples, lists and dictionaries."""
+    if isinstance(values, Tensor):
+        yield values
+    elif isinstance(values, Mapping):
+        yield from _tensors([*values.values()])
+    elif isinstance(values, tuple | list):
+        for value in values:
+            yield from _tensors(value)
+
+
+def _stand_before(module: LightningModule, update: int, batch: int) -> None:
+    """Let a module that no Trainer trains count updates and batches as it did."""
+    vars(module)["_trainer"] = SimpleNamespace(global_step=update, fit_loop=SimpleNamespace(total_batch_idx=batch))
+
+
+def _problem_of(failure: Any) -> str:
+    """Say what is wrong with the content of a failure.pt; nothing where all is well."""
+    if not isinstance(failure, dict):
+        return f"holds a {type(failure).__name__}"
+    for name, kind in _FIELDS.items():
+        if not isinstance(failure.get(name), kind):
+            return f"its {name} is {type(failure.get(name)).__name__}"
+    if not all(isinstance(value, Tensor) for value in failure["state_dict"].values()):
+        return "its state_dict holds what is no tensor"
+    for batch in failure["batches"]:
+        if not isinstance(batch, dict) or {*batch} != {*SequenceBatch._fields}:
+            return "one of its batches lacks a field"
+        if not all(isinstance(value, Tensor) for value in batch.values()):
+            return "one of its batches holds what is no tensor"
+    if len(failure["batch_numbers"]) != len(failure["batches"]):
+        return "it has not a number for each batch"
+    return ""

@@ -1,0 +1,150 @@
+"""The tables that `forbes evaluate` prints: a row for each score, a column for each run, as wide as the terminal."""
+
+import itertools
+import math
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.metrics import Measured, Pair, at_horizons, degradation
+from forbes.evaluation.references import lowest_above
+
+__all__ = ["beaten_by", "print_degradation", "print_pairs", "print_references", "print_runs"]
+
+_PIPE = 200
+"""Columns where there is no terminal: rich would take 80."""
+
+
+def print_runs(measured: Sequence[Measured]) -> None:
+    """Print every metric of every run; n/a where its model does not have it."""
+    console = _console()
+    for number, one in enumerate(measured, start=1):
+        text = f"{number}  {escape(one.run.path)}: {one.run.family}, {one.run.parameters:,} parameters"
+        console.print(text, soft_wrap=True)
+    columns = {
+        str(number): {name: _cell(name, entry) for name, entry in one.entries.items()}
+        for number, one in enumerate(measured, start=1)
+    }
+    _print(console, "nats per sequence, mean ± standard error; ess as a share of K", columns)
+
+
+def print_references(measured: Sequence[Measured]) -> None:
+    """Print what the references score on the same sequences, and explain the marks of `print_runs`."""
+    columns: dict[str, dict[str, str]] = {}
+    for name, entry in itertools.chain.from_iterable(one.entries.items() for one in measured):
+        for reference, estimate in entry.get("references", {}).items():
+            columns.setdefault(reference, {})[name] = str(_estimate(estimate))
+    if not columns:
+        return
+    console = _console()
+    _print(console, "log p of the same steps by models without a belief, nats per sequence", columns)
+    below = [one.run.path for one in measured if any(beaten_by(entry) for entry in one.entries.values())]
+    if below:
+        text = f"<: below this reference, so less was learned than it knows: {escape(', '.join(below))}"
+        console.print(text, soft_wrap=True)
+
+
+def beaten_by(entry: Mapping[str, Any]) -> str | None:
+    """Return the lowest reference above an entry of `evaluation.json`; None where it is above all or has none."""
+    return lowest_above(entry["mean"], {name: each["mean"] for name, each in entry.get("references", {}).items()})
+
+
+def print_pairs(pairs: Sequence[Pair]) -> None:
+    """Print the paired difference of every metric of which more is better; n/a where a model does not have it."""
+    runs = list(dict.fromkeys(run.run.path for pair in pairs for run in pair[:2]))
+    columns = {
+        f"{runs.index(first.run.path) + 1} − {runs.index(second.run.path) + 1}": {
+            name: _difference(difference) for name, difference in differences.items()
+        }
+        for first, second, differences in pairs
+    }
+    _print(_console(), "paired differences over the same sequences, nats per sequence (in standard errors)", columns)
+
+
+def print_degradation(measured: Sequence[Measured]) -> None:
+    """Print what the open loop loses to the closed one, for every run that has both scores."""
+    curves: dict[str, dict[str, list[float]]] = {}
+    for one in measured:
+        for name, entry in one.entries.items():
+            curves.setdefault(name, {})[one.run.path] = entry["curve"]
+    for metric, of_runs in degradation(curves).items():
+        rows = at_horizons(metric, of_runs)
+        numbers = {one.run.path: str(number) for number, one in enumerate(measured, start=1)}
+        columns = {
+            numbers[path]: {f"{horizon} steps": f"{loss:.2f}" for horizon, loss in row.items()}
+            for path, row in rows.items()
+        }
+        _print(_console(), f"{metric}: nats a prediction loses so many steps after the last one seen", columns)
+
+
+def _print(console: Console, title: str, columns: Mapping[str, Mapping[str, str]]) -> None:
+    """Print a table of named rows; where it is wider than the console, several of some columns each."""
+    names = [(name, _in_lines(name)) for name in _union(columns.values())]
+    room = console.width - max((len(line) for _, lines in names for line in lines.split("\n")), default=0) - 4
+    widths = {
+        header: max(len(line) for cell in (header, *cells.values()) for line in cell.split("\n")) + 3
+        for header, cells in columns.items()
+    }
+    console.print(f"\n{escape(title)}", soft_wrap=True)
+    for headers in _fitting(widths, room):
+        table = Table()
+        table.add_column("score", no_wrap=True)
+        for header in headers:
+            table.add_column(escape(header), justify="right", no_wrap=True)
+        for name, lines in names:
+            table.add_row(escape(lines), *(escape(columns[header].get(name, "n/a")) for header in headers))
+        console.print(table)
+
+
+def _fitting(widths: Mapping[str, int], room: int) -> Iterator[list[str]]:
+    """Part columns into groups that have room, one at least in each."""
+    group: list[str] = []
+    for header, width in widths.items():
+        if group and sum(widths[each] for each in group) + width > room:
+            yield group
+            group = []
+        group.append(header)
+    if group:
+        yield group
+
+
+def _console() -> Console:
+    return Console(width=None if sys.stdout.isatty() else _PIPE)
+
+
+def _in_lines(name: str) -> str:
+    """Break `test[:1000]/pll[categorical,K=128]` before the likelihood and the numbers."""
+    split, slash, rest = name.partition("/")
+    score, bracket, tag = rest.partition("[")
+    return f"{split}{slash}{score}\n  {bracket}{tag}" if bracket else name
+
+
+def _union(tables: Iterable[Iterable[str]]) -> list[str]:
+    """Return every name once; those that some lack come where the longest table has them."""
+    longest_first = sorted([list(names) for names in tables], key=len, reverse=True)
+    return list(dict.fromkeys(itertools.chain.from_iterable(longest_first)))
+
+
+def _cell(name: str, entry: dict[str, Any]) -> str:
+    if "/ess[" in name:
+        return f"{entry['per_step']['mean']:.3f}"
+    reference = beaten_by(entry)
+    return f"{_estimate(entry)}" + (f"\n< {reference}" if reference else "")
+
+
+def _estimate(entry: Mapping[str, float]) -> Estimate:
+    return Estimate(entry["mean"], entry["standard_error"])
+
+
+def _difference(difference: Estimate) -> str:
+    return f"{difference.mean:+.2f} ± {difference.standard_error:.2f}\n({_ratio(difference)})"
+
+
+def _ratio(difference: Estimate) -> str:
+    ratio = difference.mean / difference.standard_error if difference.standard_error > 0 else math.nan
+    return f"{ratio:+.1f}" if math.isfinite(ratio) else "n/a"

@@ -1,0 +1,71 @@
+"""How alike two stroke sets of the same digits are: in pixels, in distance, and in the order of writing."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forbes.data.strokes.file import SIDE, StrokeArrays
+from forbes.errors import ForbesError
+
+__all__ = ["Comparison", "compare_digits", "compare_sets"]
+
+
+class Comparison(NamedTuple):
+    """What two pen paths of one digit have in common."""
+
+    iou: float
+    """Pixels of both over pixels of either."""
+    chamfer: float
+    """Distance from a pixel to the other path's nearest one, in pixels: the mean over each path's, then of the two."""
+    order: float
+    """Spearman's correlation of first visits on the common pixels, up to reversal; nan with fewer than 3 of them."""
+
+
+def compare_digits(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Comparison:
+    """Compare two paths, each uint8 (P, 2)."""
+    (a, visit_a), (b, visit_b) = (np.unique(_pixel_numbers(path), return_index=True) for path in (one, other))
+    common, in_a, in_b = np.intersect1d(a, b, assume_unique=True, return_indices=True)
+    gap = np.stack(np.divmod(a, SIDE), -1)[:, None] - np.stack(np.divmod(b, SIDE), -1)  # (A, B, 2)
+    distance = np.sqrt((gap**2).sum(-1))  # (A, B)
+    return Comparison(
+        iou=len(common) / (len(a) + len(b) - len(common)),
+        chamfer=float(distance.min(1).mean() + distance.min(0).mean()) / 2,
+        order=_rank_correlation(visit_a[in_a], visit_b[in_b]),
+    )
+
+
+def _pixel_numbers(path: NDArray[np.uint8]) -> NDArray[np.int64]:
+    return path[:, 1].astype(np.int64) * SIDE + path[:, 0]
+
+
+def _rank_correlation(one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
+    """Spearman's correlation of values without ties, ρ = 1 − 6 Σ d² / (n³ − n), up to sign."""
+    n = len(one)
+    if n < 3:
+        return float("nan")
+    difference = one.argsort().argsort() - other.argsort().argsort()
+    return abs(1 - 6 * float((difference**2).sum()) / (n**3 - n))
+
+
+def compare_sets(one: StrokeArrays, other: StrokeArrays) -> dict[str, tuple[float, ...]]:
+    """Compare two sets of the same digits.
+
+    Returns:
+        For each measure its value, or the two sets' values.
+    """
+    if not np.array_equal(one.labels, other.labels):
+        raise ForbesError("the two sets have different labels, expected the same digits in the same order.")
+    sets = (one, other)
+    paths = zip(*(np.split(arrays.points, arrays.offsets[1:-1]) for arrays in sets), strict=True)
+    scores = np.array([compare_digits(a, b) for a, b in paths])  # (N, 3)
+    lengths = [np.diff(arrays.offsets) for arrays in sets]
+    return {
+        "pixel IoU, mean": (float(scores[:, 0].mean()),),
+        "Chamfer distance in pixels, mean": (float(scores[:, 1].mean()),),
+        "order correlation, mean": (float(np.nanmean(scores[:, 2])),),
+        "order correlation, median": (float(np.nanmedian(scores[:, 2])),),
+        "points a digit, median": tuple(float(np.median(length)) for length in lengths),
+        "points a digit, mean": tuple(float(length.mean()) for length in lengths),
+        "strokes a digit, mean": tuple(float(arrays.pen_up.sum() / len(arrays.labels)) for arrays in sets),
+    }

@@ -1,0 +1,188 @@
+"""Tasks of the DeepMind Control Suite (Tassa et al., 2018, arXiv 1801.00690), from pixels or from the physics."""
+
+import difflib
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forbes.envs.base import Environment, Step, repeat, require_repeat, scale_action
+from forbes.envs.rendering import choose_backend
+from forbes.errors import ForbesError
+
+__all__ = ["DeepMindControl", "measure"]
+
+_NO_RENDERING = "disable"
+"""The value of MUJOCO_GL with which dm_control loads no backend."""
+_NO_BOUND = 1e10
+"""MuJoCo's largest number, which the suite gives where an actuator has no bound."""
+_FRAMES = 10  # to measure
+
+
+class DeepMindControl(Environment):
+    r"""A task of the suite, by the name of its domain and its own: `cartpole_swingup`, `ball_in_cup_catch`.
+
+    An action in [-1, 1]^A is scaled to the actuators' bounds and held for R frames, whose rewards add up:
+
+    .. math:: r_{t+1} = \sum_{i=1}^{R} r(s_{t,i}, a_t)
+
+    The time limit of 1000 frames is a truncation; the suite says so by a discount of 1. The two tasks without one,
+    `lqr`, have actions without bounds, and are refused. Defaults are those of Dreamer
+    (arXiv 1912.01603): two frames, 64 x 64 pixels, camera 0, of the quadruped 2.
+
+    Args:
+        task: the name.
+        pixels: observe uint8 `(3, size, size)`; else what the task measures, float32 `(O,)`, in the suite's order.
+        action_repeat: R.
+        camera: number of the camera.
+        size: pixels a side.
+        fast: render without shadows, which on a processor cost more than all the rest; other pixels, so not for
+            published numbers. Multisampling stays: without it a thin pole falls between the pixels of a small frame.
+        backend: of OpenGL, proved to render; by default the one that `choose_backend` proves.
+
+    Raises:
+        ForbesError: for an unknown task or camera, one without bounds of its actions, or when nothing renders.
+
+    Example:
+        >>> environment = forbes.DeepMindControl("cartpole_swingup", pixels=False)
+        >>> environment.reset(seed=0).observation.shape
+        (5,)
+        >>> environment.step(torch.zeros(1).numpy()).truncated
+        False
+    """
+
+    def __init__(
+        self,
+        task: str,
+        pixels: bool = True,
+        action_repeat: int = 2,
+        camera: int | None = None,
+        size: int = 64,
+        fast: bool = False,
+        backend: str | None = None,
+    ) -> None:
+        require_repeat(task, action_repeat)
+        if find_spec("dm_control") is None:  # before what renders is looked for, which would say so of every backend
+            raise ForbesError(f"{task}: dm_control is not installed. pip install 'forbes[dmc]'")
+        self.task, self.pixels, self.action_repeat, self.size, self.fast = task, pixels, action_repeat, size, fast
+        self.backend = (backend or choose_backend().backend) if pixels else _NO_RENDERING
+        self._environment = _load(task, self.backend)
+        spec = self._environment.action_spec()
+        self._low, self._high, self.action_dim = spec.minimum, spec.maximum, spec.shape[0]
+        if (self._high >= _NO_BOUND).any():
+            raise ForbesError(
+                f"{task}: its actions have no bounds that [-1, 1] could be scaled to. Choose another task"
+            )
+        self.camera = camera if camera is not None else 2 if task.startswith("quadruped") else 0
+        self.observation_shape = (3, size, size) if pixels else self.reset(0).observation.shape
+        if pixels:
+            self._prepare_rendering()
+
+    def _prepare_rendering(self) -> None:
+        """Set what cannot be changed after the first frame."""
+        model = self._environment.physics.model
+        if not 0 <= self.camera < model.ncam:
+            raise ForbesError(f"{self.task}: has no camera {self.camera}, expected 0 to {model.ncam - 1}. Choose one")
+        model.vis.global_.offwidth = model.vis.global_.offheight = self.size  # the default buffer costs 20 % more
+        if self.fast:
+            model.vis.quality.shadowsize = 0
+
+    def reset(self, seed: int) -> Step:
+        """See `Environment.reset`: all the chance of an episode comes from the task's generator."""
+        self._environment.task.random.seed(seed)
+        return Step(self._observe(self._environment.reset()))
+
+    def step(self, action: NDArray[np.float32]) -> Step:
+        """See `Environment.step`; only the last frame is rendered."""
+        scaled = scale_action(action, self._low, self._high)
+        last: Any = None
+
+        def frame() -> Step:
+            nonlocal last
+            last = self._environment.step(scaled)
+            ends = last.last()
+            return Step(np.empty(0), last.reward, ends and last.discount == 0, ends and last.discount != 0)
+
+        return repeat(frame, self.action_repeat)._replace(observation=self._observe(last))
+
+    def _observe(self, time_step: Any) -> NDArray[Any]:
+        if not self.pixels:
+            return np.concatenate([np.ravel(part) for part in time_step.observation.values()]).astype(np.float32)
+        frame = self._environment.physics.render(self.size, self.size, camera_id=self.camera)  # (H, W, 3)
+        if (frame == frame[0, 0]).all():
+            raise RuntimeError(f"{self.backend} renders a frame of one colour")
+        return np.ascontiguousarray(frame.transpose(2, 0, 1))  # (3, H, W)
+
+    def describe(self) -> dict[str, Any]:
+        """See `Environment.describe`."""
+        made_by = {name: version(name) for name in ("dm-control", "mujoco")}
+        if not self.pixels:
+            return {"task": self.task, "pixels": False, "made_by": made_by}
+        made_by |= {"backend": self.backend, "gl_renderer": self._gl_renderer()}
+        return {"task": self.task, "pixels": True, "camera": self.camera, "fast": self.fast, "made_by": made_by}
+
+    def _gl_renderer(self) -> str:
+        """Name the device or the software that draws."""
+        from OpenGL import GL
+
+        with self._environment.physics.contexts.gl.make_current() as context:
+            name: bytes = context.call(GL.glGetString, GL.GL_RENDERER)
+        return name.decode()
+
+
+def _load(task: str, backend: str) -> Any:
+    """Import the suite for a backend and load a task.
+
+    Raises:
+        ForbesError: where it was imported for another backend, or has no such task.
+    """
+    with _environment_variable("MUJOCO_GL", backend):  # it is read at the first import
+        from dm_control import _render, suite
+    if backend not in (_NO_RENDERING, _render.BACKEND):
+        raise ForbesError(
+            f"{task}: this process has imported dm_control with MUJOCO_GL={_render.BACKEND}, expected {backend}. "
+            "Import nothing of it before, or use EnvironmentProcess"
+        )
+    names = {f"{domain}_{name}": (domain, name) for domain, name in suite.ALL_TASKS}
+    if task not in names:
+        near = difflib.get_close_matches(task, names, n=3, cutoff=0.5)
+        hint = f"Did you mean {' or '.join(near)}?" if near else "`forbes data collect --help` says what there is"
+        raise ForbesError(f"{task}: no such task. {hint}")
+    return suite.load(*names[task])
+
+
+@contextmanager
+def _environment_variable(name: str, value: str) -> Iterator[None]:
+    """Set a variable of the process for a while."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+
+
+def measure(backend: str) -> None:
+    """Print GL_RENDERER and frames per second as JSON; in the probe's own process.
+
+    Raises:
+        RuntimeError: when the same state does not give the same frame.
+    """
+    environment = DeepMindControl("cartpole_balance", action_repeat=1, backend=backend)
+    if (environment.reset(0).observation != environment.reset(0).observation).any():
+        raise RuntimeError("the same state gives two different frames")
+    action, began = np.zeros(environment.action_dim, np.float32), time.perf_counter()
+    for _ in range(_FRAMES):
+        environment.step(action)
+    frames_per_second = _FRAMES / (time.perf_counter() - began)
+    print(json.dumps([environment.describe()["made_by"]["gl_renderer"], frames_per_second]))

@@ -1,0 +1,1 @@
+"""Calibration: whether a belief is as certain as it should be."""

@@ -1,0 +1,68 @@
+r"""Is the filter the exact one of the model's own process? A check of any trained model, without ground truth.
+
+Draw :math:`(s, o)` from the model's prior, run the filter on o, and rank the drawn :math:`s_t` among samples of the
+belief :math:`q(s_t \mid o_{1:t})`. The ranks are uniform if the belief is the exact filtering posterior of the model
+(simulation-based calibration, Talts et al., 2018, arXiv 1804.06788). A filter that was trained by the ELBO is expected
+to fail: its beliefs are too narrow (`forbes theorem`), and the ranks pile up at both ends.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from forbes.evaluation.calibration.ranks import TwoSampleTest, ranks, tarp_ranks, two_sample_test
+from forbes.evaluation.scores import LogMeanExp
+from forbes.models import Seen, StateSpaceModel
+from forbes.seeding import derive_seed, generator
+
+__all__ = ["SelfCalibration", "self_calibration"]
+
+_COMPONENTS = 20
+"""Posterior trajectories whose mixture estimates the belief's density; any function of (s, o) has uniform ranks."""
+
+
+class SelfCalibration(NamedTuple):
+    """Ranks of N drawn states among L samples of their beliefs, 0 to L."""
+
+    value: Tensor
+    """Of each dimension of s_t, `(N, D)`."""
+    density: Tensor
+    """Of the belief's log-density, the mixture over posterior trajectories, `(N,)`."""
+    tarp: Tensor
+    """Of the distance from a random point, `(N,)`."""
+    classifier: TwoSampleTest
+    """Tells the drawn state from one sample of its belief, given the mean of the others."""
+
+
+@torch.no_grad()
+def self_calibration(model: StateSpaceModel, action: Tensor, samples: int, seed: int = 0) -> SelfCalibration:
+    """Rank the last state of each sequence that the model imagines.
+
+    Args:
+        model: in eval mode, on the action's device.
+        action: a_{t-1} of N sequences up to the step that is checked, `(N, t, A)`.
+        samples: L, of each belief; each from a draw of the belief of its own, since the belief is over (h, s).
+        seed: of everything that is drawn.
+    """
+    devices = [action.device] if action.device.type == "cuda" else []
+    with torch.random.fork_rng(devices):
+        torch.manual_seed(derive_seed(seed, "self-calibration", 0))
+        rollout = model.imagine(model.initial(len(action)), action)
+        observation = model.likelihood.sample(model.decode(rollout.features))  # (N, t, *O)
+        seen = Seen(observation, model.encode(observation), action)
+        truth = rollout.state[:, -1]  # (N, D)
+        draws = torch.stack([model.beliefs(seen, 1).state for _ in range(samples + 1)])  # (L + 1, N, D)
+        of_truth, of_draws = LogMeanExp(), LogMeanExp()
+        for _ in range(_COMPONENTS):
+            context = model.filter(seen.embedding, action).context[:, -1]  # (N, C)
+            of_truth.add(model.posterior.log_prob(truth, context).double())
+            of_draws.add(model.posterior.log_prob(draws[1:], context).double())
+    draw = generator(seed, "ties", 0)
+    truth, draws = truth.double().cpu(), draws.double().cpu()
+    return SelfCalibration(
+        value=ranks(truth, draws[1:], draw),
+        density=ranks(of_truth.result().cpu(), of_draws.result().cpu(), draw),
+        tarp=tarp_ranks(truth, draws, draw),
+        classifier=two_sample_test(truth, draws, generator(seed, "classifier", 0)),
+    )

@@ -1,0 +1,41 @@
+"""Episodes of images: strips of their frames."""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from forbes.data.episodes.episode import Episode
+
+__all__ = ["MAX_CHANNELS", "draw_strips", "to_rgb"]
+
+T = TypeVar("T", bound=np.generic)
+
+MAX_CHANNELS = 4
+"""Of a frame that pictures can show."""
+_FRAMES = 10
+
+
+def to_rgb(frames: NDArray[T]) -> NDArray[T]:
+    """Return frames `(*, C, H, W)` in three colours, `(*, 3, H, W)`: any type and range of numbers.
+
+    One channel is grey; two are red and cyan, so white stays white; the last of four (opacity, or depth) is left out.
+    """
+    shown = {1: [0, 0, 0], 2: [0, 1, 1]}.get(frames.shape[-3], [0, 1, 2])
+    return frames[..., shown, :, :]  # (*, 3, H, W)
+
+
+def draw_strips(episodes: Sequence[tuple[str, Episode]]) -> Figure:
+    """Draw a row for each episode of images: ten frames, evenly spaced from its first to its last, with their time."""
+    figure = Figure(figsize=(1.0 * _FRAMES, 1.25 * len(episodes)), layout="constrained")
+    axes = figure.subplots(len(episodes), _FRAMES, squeeze=False)
+    for row, (name, episode) in zip(axes, episodes, strict=True):
+        times = np.linspace(0, len(episode.reward) - 1, _FRAMES).round().astype(int)
+        for axis, time in zip(row, times, strict=True):
+            axis.imshow(to_rgb(episode.observation[time]).transpose(1, 2, 0))  # (H, W, 3)
+            axis.set(xticks=[], yticks=[])
+            axis.set_title(f"t = {time}", fontsize=7)
+        row[0].set_ylabel(name, fontsize=7)
+    return figure

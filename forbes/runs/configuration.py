@@ -1,0 +1,162 @@
+"""What a configuration may name and what is linked to what; how a run's configuration becomes a model and its data."""
+
+import importlib
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jsonargparse import Namespace, set_parsing_settings
+from lightning import Callback, LightningDataModule, LightningModule
+from lightning.fabric.plugins import CheckpointIO, ClusterEnvironment, Precision
+from lightning.pytorch.accelerators import Accelerator
+from lightning.pytorch.cli import LightningArgumentParser
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins import LayerSync
+from lightning.pytorch.profilers import Profiler
+from lightning.pytorch.strategies import Strategy
+from torch import nn
+
+import forbes
+from forbes.data import SequenceDataModule, SequenceSource
+from forbes.errors import ForbesError
+from forbes.models import Likelihood
+from forbes.pomdps import Process
+
+__all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "changed_defaults", "data_paths"]
+__all__ += ["experiment_parser", "require_classes"]
+
+_OF_FORBES = ("beliefs", "callbacks", "data", "models", "pomdps", "training")
+_OF_LIGHTNING = ("accelerators", "callbacks", "loggers", "plugins", "profilers", "strategies")
+TRUSTED = (
+    *(f"forbes.{name}" for name in forbes.MODULES),
+    *(f"forbes.{part}" for part in _OF_FORBES),
+    *(f"lightning.pytorch.{part}" for part in _OF_LIGHTNING),
+    "lightning.fabric.plugins",
+)
+"""Packages whose classes a configuration may name, and the public names of `import forbes`."""
+_REFUSED = ("*",)  # all else
+FAMILIES: tuple[type, ...] = (
+    *(nn.Module, Likelihood, LightningDataModule, SequenceSource, Process, Callback, Logger, Profiler),
+    *(Accelerator, CheckpointIO, ClusterEnvironment, LayerSync, Precision, Strategy),
+)
+"""What these classes derive from."""
+_BY_A_CLASS = "Name a class of forbes or Lightning, or one of your own with --allow-module MODULE"
+_allowed: dict[str, None] = {}  # in their order, as long as the process lives: jsonargparse keeps them too
+
+
+def allow_modules(names: Sequence[str] = ()) -> None:
+    """Let configurations name classes of `TRUSTED` and of the given modules, nothing else.
+
+    A configuration may come from anywhere, and to name a class is to import, hence to run, its module. A given module
+    is imported, from the working directory or as installed, so that its classes are known by their short names. Where
+    any value is accepted, a class that is named stays a name. See `require_classes` for what else is refused.
+
+    Raises:
+        ForbesError: when a given module does not exist.
+    """
+    if names and "" not in sys.path:
+        sys.path.append("")
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            raise ForbesError(f"--allow-module {name}: {error}. Name an installed one or one of this folder") from error
+    _allowed.update(dict.fromkeys(names))
+    set_parsing_settings(
+        import_path_denylist=[*_REFUSED],
+        import_path_allowlist=[*TRUSTED, *names],
+        instantiate_subclass_spec_in_any=False,
+    )
+
+
+def allowed_modules() -> list[str]:
+    """Return the flags that let another process name the classes of the same modules."""
+    return [part for name in _allowed for part in ("--allow-module", name)]
+
+
+def require_classes(config: Any, key: str = "") -> None:
+    """Refuse a parsed configuration that would call anything but a class of `FAMILIES` or of an allowed module.
+
+    jsonargparse compares classes with the type of the parameter, but calls any function, with the arguments of the
+    configuration, where a parameter is a Callable. A function of an allowed module may be given by its name alone.
+
+    Args:
+        config: what jsonargparse has parsed and not yet instantiated, or a part of it.
+        key: of the part.
+
+    Raises:
+        ForbesError: for the first name that is refused.
+    """
+    if isinstance(config, Namespace):
+        config = vars(config)
+    if isinstance(config, Mapping):
+        if "class_path" in config:
+            _require_class(str(config["class_path"]), key)
+        for name, value in config.items():
+            require_classes(value, key if name == "init_args" else f"{key}.{name}".removeprefix("."))
+    elif isinstance(config, list | tuple | set | frozenset):
+        for value in config:
+            require_classes(value, key)
+    elif not callable(config) or isinstance(config, os.PathLike):  # a path: of a file that a part was read from
+        return
+    elif not _is_allowed(getattr(config, "__module__", None)):
+        raise ForbesError(f"{key}: is a {type(config).__name__}, expected a class. {_BY_A_CLASS}")
+
+
+def _require_class(path: str, key: str) -> None:
+    """Refuse a path that is not that of a class; whatever was parsed is imported already."""
+    module, _, name = path.rpartition(".")
+    kind = getattr(sys.modules.get(module), name, None)
+    if not isinstance(kind, type) or not (issubclass(kind, FAMILIES) or _is_allowed(kind.__module__)):
+        raise ForbesError(f"{key}: {path} is not a class that fits here. {_BY_A_CLASS}")
+
+
+def _is_allowed(module: str | None) -> bool:
+    """Tell whether a module, or the package it is in, was given to `allow_modules`."""
+    return any(f"{module}.".startswith(f"{name}.") for name in _allowed)
+
+
+def add_seed(parser: LightningArgumentParser) -> None:
+    """Add the one seed of an experiment."""
+    parser.add_argument(
+        "--seed_everything",
+        type=int,
+        default=0,
+        help="seed of the weights, the noise, the order of the data and an agent's episodes",
+    )
+
+
+def add_links(parser: LightningArgumentParser) -> None:
+    """Link the data's shapes, and whether its actions are discrete, to the model's arguments, and the seed to both."""
+    for name in ("observation_shape", "action_dim", "discrete"):
+        parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
+    for part in ("model", "data"):
+        parser.link_arguments("seed_everything", f"{part}.init_args.seed")
+
+
+def changed_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return, by its key, what an older run did not write and had by a default that has changed since.
+
+    Strokes were whole frames before `frames` could be chosen.
+    """
+    data = config.get("data")
+    source = data.get("init_args", {}).get("source") if isinstance(data, dict) else None
+    if not isinstance(source, dict) or not str(source.get("class_path")).endswith("Strokes"):
+        return {}
+    return {} if "frames" in source.get("init_args", {}) else {"data.init_args.source.init_args.frames": "whole"}
+
+
+def data_paths(data: Namespace) -> dict[str, str]:
+    """Return the files and folders that the section `data` names, by key: all arguments called `path`."""
+    return {key: value for key, value in data.items() if key.split(".")[-1] == "path" and isinstance(value, str)}
+
+
+def experiment_parser() -> LightningArgumentParser:
+    """Return a parser of what makes a model and its data, without the trainer."""
+    parser = LightningArgumentParser(exit_on_error=False)
+    add_seed(parser)
+    parser.add_lightning_class_args(LightningModule, "model", subclass_mode=True)
+    parser.add_lightning_class_args(SequenceDataModule, "data", subclass_mode=True)
+    add_links(parser)
+    return parser

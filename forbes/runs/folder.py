@@ -1,0 +1,187 @@
+"""Run folders: everything that one training leaves, in one place that no two processes share."""
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+import forbes
+from forbes.errors import ForbesError
+from forbes.files import locked, remove_halves, require_no_links
+from forbes.reading import is_number, read_yaml
+
+__all__ = ["RunFolder", "experiment_name", "read_config", "read_metrics"]
+
+_MOVED = {"forbes.training.callbacks": "forbes.callbacks"}
+"""Packages whose classes older runs name in full, and where they are now."""
+
+
+class RunFolder:
+    """Where the files of a run are.
+
+    ``runs/<experiment>/<time>-<seed>/``::
+
+        config.yaml        the whole configuration, defaults included
+        provenance.json    what was run, when, by which versions, on what data: one entry for each start
+        metrics.jsonl      one JSON object a line: {"update": n, "epoch": e, name: value, ...}
+        checkpoints/       last.ckpt; previous.ckpt, which is read where the last one is damaged; best.ckpt by the
+                           validation bound or an agent's return
+        failure.pt         after a divergence: what repeats the update that is not finite (`forbes replay`)
+        figures/
+        evaluation.json    and evaluation.npz, what `forbes evaluate` has measured
+        evaluation-best/   the same of another checkpoint, here checkpoints/best.ckpt
+        .lock              held by the process that trains here; .evaluation.lock by one that writes evaluation.json
+
+    In config.yaml the `path` of the data is absolute, so that a run can be resumed and measured from any folder. The
+    run folder itself may be moved, copied or read-only.
+
+    Args:
+        path: the folder; it need not exist yet. Or one of its checkpoints, `RUN/checkpoints/best.ckpt`, to read it
+            instead of the last one.
+    """
+
+    LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
+
+    def __init__(self, path: Path | str) -> None:
+        path = Path(path)
+        chosen = path if path.suffix == ".ckpt" else None
+        self.path = path if chosen is None else path.parent.parent
+        self.config = self.path / "config.yaml"
+        self.provenance = self.path / "provenance.json"
+        self.metrics = self.path / "metrics.jsonl"
+        self.failure = self.path / "failure.pt"
+        last = self.path / "checkpoints" / self.LAST
+        self.checkpoint = chosen or last
+        self.results = self.path if self.checkpoint == last else self.path / f"evaluation-{self.checkpoint.stem}"
+        self.figures = self.path / "figures"
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @classmethod
+    def new(cls, experiment: str, started: str, seed: int) -> "RunFolder":
+        """Make a folder of its own for a run of an experiment that starts now."""
+        first = path = Path("runs") / experiment / f"{started}-{seed}"
+        number = 1
+        while True:
+            try:
+                path.mkdir(parents=True)
+            except FileExistsError:  # another started in the same second
+                number += 1
+                path = first.with_name(f"{first.name}-{number}")
+            else:
+                return cls(path)
+
+    @classmethod
+    def trained(cls, path: Path | str) -> "RunFolder":
+        """Open the folder of a run that has a checkpoint.
+
+        Raises:
+            ForbesError: when there is no such run, it was stopped before its first checkpoint, or a folder in it is a
+                symbolic link, through which results would be written elsewhere.
+        """
+        run = cls(path)
+        if not run.path.is_dir():
+            raise ForbesError(f"{run}: no such run folder. `forbes fit` makes one, under runs/")
+        if not run.config.is_file():
+            raise ForbesError(f"{run}: not a run folder, config.yaml is missing. Name a folder that `forbes fit` made")
+        if run.results != run.path and not run.checkpoint.is_file():
+            there = sorted(path.name for path in run.checkpoint.parent.glob("*.ckpt"))
+            raise ForbesError(f"{run.checkpoint}: no such checkpoint. There are {', '.join(there) or 'none'}")
+        if not run.checkpoint.is_file():
+            raise ForbesError(f"{run}: has no checkpoint yet. Train it: forbes fit --config {run.config}")
+        require_no_links(path for path in run.path.iterdir() if path.is_dir())
+        return run
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep every other process from training in this folder; the system frees it when the process dies."""
+        with locked(self.path, "trains here. Choose another --run_dir"):
+            remove_halves(self.path, self.config.name, self.provenance.name, self.failure.name)
+            remove_halves(self.checkpoint.parent, "*.ckpt")
+            yield
+
+
+def experiment_name(configs: Sequence[str]) -> str:
+    """Name an experiment after its first configuration: configs/strokes/forbes.yaml is strokes/forbes."""
+    if not configs:
+        return "unnamed"
+    parts = Path(configs[0]).with_suffix("").parts
+    if "configs" in parts:
+        return "/".join(parts[len(parts) - parts[::-1].index("configs") :])
+    return parts[-1]
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Read the config.yaml of a run, with the public name of each class, which an older run has in full.
+
+    Raises:
+        ForbesError: where it is not what `forbes fit` writes.
+    """
+    remedy = "Restore it, or name another run"
+    config = read_yaml(path, remedy)
+    if not isinstance(config, dict):
+        raise ForbesError(f"{path}: holds a {type(config).__name__}, expected sections model and data. {remedy}")
+    for name in ("model", "data"):
+        section = config.get(name)
+        if not isinstance(section, dict) or not isinstance(section.get("class_path"), str):
+            raise ForbesError(f"{path}: its section {name} has no class_path, expected the name of a class. {remedy}")
+        if not isinstance(section.setdefault("init_args", {}), dict):
+            raise ForbesError(f"{path}: {name}.init_args is no mapping, expected arguments by name. {remedy}")
+    named: dict[str, Any] = _with_public_names(config)
+    return named
+
+
+def _with_public_names(section: Any) -> Any:
+    """Return a part of a configuration with each class where it is now.
+
+    `forbes.training.WorldModel` becomes `forbes.WorldModel`, and a package that has moved has its new name.
+    """
+    if isinstance(section, list):
+        return [_with_public_names(value) for value in section]
+    if isinstance(section, dict):
+        return {key: _with_public_names(value) for key, value in section.items()}
+    module, _, name = section.rpartition(".") if isinstance(section, str) else ("", "", "")
+    if module and forbes.MODULES.get(name) == module:
+        return f"forbes.{name}"
+    return f"{_MOVED[module]}.{name}" if module in _MOVED else section
+
+
+def read_metrics(run: Path | str) -> pd.DataFrame:
+    """Read a run's metrics: a row for each update, a column for each name, the last value where there are several.
+
+    A run that was killed and resumed repeats the updates after its checkpoint; the lines of the first life are dropped.
+
+    Raises:
+        ForbesError: when the file is missing or a line is not what `forbes fit` writes.
+    """
+    path = RunFolder(run).metrics
+    if not path.is_file():
+        raise ForbesError(f"{path}: no such file. Name a run folder that `forbes fit` made")
+    rows: dict[int, dict[str, Any]] = {}
+    *lines, _ = path.read_bytes().split(b"\n")  # a kill cut the last line short; or it is being written
+    for number, line in enumerate(lines, start=1):
+        try:
+            record = json.loads(line)
+        except (ValueError, RecursionError):
+            record = None
+        if not _is_line_of_metrics(record):
+            raise ForbesError(f"{path}: line {number} is not a line of metrics. Repair or delete it")
+        update = record.pop("update")
+        if record.pop("start", False):
+            rows = {known: row for known, row in rows.items() if known <= update}
+        else:
+            rows.setdefault(update, {}).update(record)
+    table = pd.DataFrame.from_dict(dict(sorted(rows.items())), orient="index")
+    table.index.name = "update"
+    return table
+
+
+def _is_line_of_metrics(record: Any) -> bool:
+    """Tell whether this is what `JsonLinesLogger` writes: an update, and numbers."""
+    if not isinstance(record, dict) or type(record.get("update")) is not int:
+        return False
+    return all(is_number(value) for name, value in record.items() if name != "start")

@@ -1,0 +1,150 @@
+"""Provenance: what was run, when, on which machine, by which versions and on what data."""
+
+import json
+import os
+import platform
+import shlex
+import subprocess
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from jsonargparse import Namespace
+from lightning import LightningModule, Trainer
+from lightning.pytorch.cli import LightningArgumentParser, SaveConfigCallback
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+import forbes
+from forbes.errors import ForbesError
+from forbes.files import replace_file
+from forbes.reading import read_json
+from forbes.runs.configuration import allowed_modules
+from forbes.runs.folder import RunFolder
+from forbes.runs.stop import StopOnSignal
+
+__all__ = ["RecordRun", "command_line", "commit", "read_provenance"]
+
+PACKAGES = ("torch", "lightning", "jsonargparse", "numpy", "dm-control", "mujoco", "gymnasium")
+"""What may change the numbers of a run; the last three are optional."""
+
+
+class RecordRun(SaveConfigCallback):
+    """Writes `config.yaml` and `provenance.json`, an entry for each start; completes the entry at the end.
+
+    An entry without `exit_status` belongs to a process that was killed, or still runs.
+
+    Args:
+        parser: of the command line.
+        config: the whole configuration.
+        run: where the files go.
+        stop: knows which signal has ended the training.
+        arguments: of the command line.
+    """
+
+    def __init__(
+        self,
+        parser: LightningArgumentParser,
+        config: Namespace,
+        run: RunFolder,
+        stop: StopOnSignal,
+        arguments: Sequence[str],
+    ) -> None:
+        super().__init__(parser, config, save_to_log_dir=False)
+        self.run, self.stop, self.arguments = run, stop, arguments
+        self._began = time.monotonic()
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Write both files before the training starts."""
+        replace_file(self.run.config, self.parser.dump(self.config, skip_unset=False).encode())
+        path = self.run.provenance
+        self._entries = read_provenance(path) if path.is_file() else []
+        seed = {"seed": self.config["seed_everything"]}
+        self._entries.append(_describe(self.arguments) | seed | _describe_data(trainer))
+        self._write()
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Note success."""
+        self._end(0)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Note failure, or the signal that has ended the training."""
+        failed = exception.exit_status if isinstance(exception, ForbesError) else 1
+        with suppress(ForbesError):  # on a full disk; why the training has failed is worth more than its record
+            stopped = isinstance(exception, SIGTERMException) or self.stop.received is not None
+            self._end(self.stop.exit_status if stopped else failed)
+
+    def _end(self, exit_status: int) -> None:
+        if self.already_saved:
+            hours = round((time.monotonic() - self._began) / 3600, 4)
+            self._entries[-1] |= {"hours": hours, "exit_status": exit_status}
+            self._write()
+
+    def _write(self) -> None:
+        replace_file(self.run.provenance, json.dumps(self._entries, indent=2).encode() + b"\n")
+
+
+def read_provenance(path: Path) -> list[dict[str, Any]]:
+    """Read provenance.json.
+
+    Raises:
+        ForbesError: where it is not a list of starts.
+    """
+    remedy = "Move it out of the run folder, and give the command again"
+    entries = read_json(path, remedy)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ForbesError(f"{path}: expected a list with an entry for each start. {remedy}")
+    return entries
+
+
+def _describe(arguments: Sequence[str]) -> dict[str, Any]:
+    """Return what does not depend on the configuration."""
+    return {
+        "command": command_line(*arguments),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit(),
+        "versions": _versions(),
+        "machine": {
+            "name": platform.node(),
+            "system": platform.platform(),
+            "cpus": os.cpu_count(),
+            "threads": torch.get_num_threads(),
+            "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        },
+    }
+
+
+def _versions() -> dict[str, str]:
+    versions = {"forbes": forbes.__version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions
+
+
+def _describe_data(trainer: Trainer) -> dict[str, Any]:
+    """Return the hash of the data."""
+    return {"data_sha256": trainer.datamodule.source.sha256()}  # type: ignore[attr-defined]
+
+
+def command_line(*arguments: str) -> str:
+    """Return the command line to repeat a command, with the modules that this process was allowed to use."""
+    return shlex.join(["forbes", *allowed_modules(), *arguments])
+
+
+def commit() -> str | None:
+    """Return the commit of the checkout this runs from, +dirty with changed files; None where git knows none."""
+    root = Path(forbes.__file__).parents[1]
+    if not (root / ".git").exists():
+        return None
+    git = ["git", "-C", str(root)]
+    try:
+        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        changes = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return head.stdout.strip() + ("+dirty" if changes.stdout.strip() else "")

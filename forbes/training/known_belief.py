@@ -1,0 +1,196 @@
+"""A learned belief of a known process as a LightningModule: it optimises and logs, the mathematics is in the model."""
+
+import math
+from typing import Any, Literal
+
+import torch
+from lightning import LightningModule
+from torch import Tensor
+from torch.optim import Adam, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from forbes.beliefs import BeliefFamily
+from forbes.data import SequenceBatch, SequenceDataModule, Simulated
+from forbes.errors import ForbesError
+from forbes.models.elbo import elbo_loss
+from forbes.models.known_model import KnownModel, Units
+from forbes.performance.precision import full_precision
+from forbes.pomdps import CategoricalBelief, Process
+from forbes.pomdps.base import require_positive
+from forbes.pomdps.distributions import PointMass
+from forbes.seeding import derive_seed, generator
+from forbes.training.divergence import hold_unless_finite
+from forbes.training.world_model import batches_before, follow_rates
+
+__all__ = ["KnownBelief", "Objective", "has_transition_density"]
+
+Objective = Literal["state_nll", "elbo"]
+
+_EXAMPLES, _STEPS = 1000, 30
+"""Sequences, and their length, that the units of states and observations are taken from."""
+
+
+class KnownBelief(LightningModule):
+    r"""Learns q(s_t | o_1:t, a_1:t-1) of a process whose densities are known, so that its error can be measured.
+
+    The objectives, in nats per step:
+
+    .. math:: L_{nll} = -\frac1T \sum_t \log q(s_t \mid o_{1:t}), \quad (s, o) \sim p, \qquad
+              L_{elbo} = -\frac1T\, E_q\left[\log p(s, o) - \log q(s \mid o)\right]
+
+    The first is a proper score: its minimum is the exact belief, and what exceeds it is KL(exact ‖ q). The second is
+    what world models are trained by, and prefers a belief that is too narrow (`forbes theorem`).
+
+    Args:
+        process: e.g. `MirrorSensor`; the same as the data's.
+        belief: the family of q, a class of `forbes.beliefs` with its own arguments.
+        objective: "state_nll", which sees the states, or "elbo".
+        observation_shape: of one observation; the command line takes it from the data.
+        action_dim: A; likewise.
+        hidden_dim: H of the GRU that reads the observations.
+        mlp_dim: width of the perceptron between the GRU and the belief.
+        mlp_layers: layers of it.
+        learning_rate: of Adam at the start; it falls to 0 along a cosine.
+        seed: of the noise of training and validation.
+
+    Raises:
+        ForbesError: where the data are not of the process, the process lacks a density that the objective needs, or a
+            size or the rate is not above 0.
+
+    Example:
+        >>> process = forbes.MirrorSensor()
+        >>> data = forbes.SequenceDataModule(forbes.Simulated(process, train=100), length=20)
+        >>> known = forbes.KnownBelief(process, forbes.MixtureBelief)
+        >>> known.state_nll(data.sequences("train", torch.arange(5))).shape
+        torch.Size([5, 20])
+    """
+
+    def __init__(
+        self,
+        process: Process,
+        belief: BeliefFamily,
+        objective: Objective = "state_nll",
+        observation_shape: tuple[int, ...] = (1,),
+        action_dim: int = 0,
+        hidden_dim: int = 64,
+        mlp_dim: int = 64,
+        mlp_layers: int = 1,
+        learning_rate: float = 3e-3,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        sizes = {"hidden_dim": hidden_dim, "mlp_dim": mlp_dim, "mlp_layers": mlp_layers}
+        require_positive("KnownBelief", **sizes, learning_rate=learning_rate)
+        _require_density(process, objective)
+        if (*observation_shape, action_dim) != (process.observation_dim, process.action_dim):
+            raise _not_its_data(process, f"observations of shape {(*observation_shape,)} and {action_dim} actions")
+        self.process, self.objective, self.learning_rate, self.seed = process, objective, learning_rate, seed
+        state, observation, action = process.sample(_EXAMPLES, _STEPS, generator(0, "units", 0))
+        inputs = torch.cat((observation, action), -1)  # (N, T, O + A)
+        units = Units(state.flatten(0, 1)), Units(inputs.flatten(0, 1))
+        self.model = KnownModel(process, belief, *units, hidden_dim, mlp_dim, mlp_layers)
+
+    @property
+    def objective_name(self) -> str:
+        """Name the metric, without its split, that says how the training goes."""
+        return "loss"
+
+    def setup(self, stage: str) -> None:
+        """Refuse data of another process."""
+        self.require_data(self.trainer.datamodule)  # type: ignore[attr-defined]
+
+    def require_data(self, data: SequenceDataModule) -> None:
+        """Refuse data of another process; the same one draws the same sequences from the same noise."""
+        source = data.source
+        if not isinstance(source, Simulated):
+            raise _not_its_data(self.process, f"those of {type(source).__name__}")
+        ours, theirs = (process.sample(2, 10, generator(0, "same", 0)) for process in (self.process, source.process))
+        if not all(map(torch.equal, ours, theirs)):
+            raise _not_its_data(self.process, f"those of {source.process}")
+
+    def state_nll(self, batch: SequenceBatch) -> Tensor:
+        """Return -log q(s_t | o_1:t) of the true states in nats, `(B, T)`."""
+        with full_precision(batch.state):
+            return -self.model.belief(batch.observation, batch.action).log_prob(batch.state)
+
+    def loss(self, batch: SequenceBatch) -> Tensor:
+        """Return the objective in nats per step, a scalar."""
+        if self.objective == "state_nll":
+            return self.state_nll(batch).mean()
+        with full_precision(batch.state):
+            return elbo_loss(self.model.elbo(batch.observation, batch.action, batch.mask))
+
+    def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
+        """Seed the noise of this batch, so that a resumed run draws the same."""
+        torch.manual_seed(derive_seed(self.seed, "update", batches_before(self)))
+
+    def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
+        """Return and log the loss of one update."""
+        loss = self.loss(batch)
+        self.log("train/loss", loss.detach(), batch_size=len(batch.mask))
+        return loss
+
+    def on_validation_epoch_start(self) -> None:
+        """Seed the noise of a validation, the same each time."""
+        torch.manual_seed(derive_seed(self.seed, "validation", 0))
+
+    def validation_step(self, batch: SequenceBatch, batch_idx: int) -> None:
+        """Log the loss of the validation split, and the proper score."""
+        self._log("val", batch)
+
+    def test_step(self, batch: SequenceBatch, batch_idx: int) -> None:
+        """Log the same of the test split; `forbes beliefs` says how far the belief is from the exact one."""
+        self._log("test", batch)
+
+    def predict_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
+        """Return -log q(s_t | o_1:t) of the true states in nats, `(B, T)`."""
+        return self.state_nll(batch)
+
+    def configure_optimizers(self) -> Any:
+        """Adam, whose rate falls along half a cosine."""
+        optimizer = Adam(self.parameters(), lr=self.learning_rate, fused=True)
+        scheduler = LambdaLR(optimizer, self._rate)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
+        """Make no step where the gradient is not finite."""
+        gradients = [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
+        hold_unless_finite(optimizer, torch.nn.utils.get_total_norm(gradients), self.global_step)
+
+    def on_train_start(self) -> None:
+        """See `WorldModel.on_train_start`."""
+        follow_rates(self, [self.learning_rate])
+
+    def _rate(self, update: int) -> float:
+        """Return the learning rate of an update as a share of `learning_rate`."""
+        return 0.5 * (1 + math.cos(math.pi * min(1.0, update / self.trainer.estimated_stepping_batches)))
+
+    def _log(self, split: str, batch: SequenceBatch) -> None:
+        values = {f"{split}/loss": self.loss(batch), f"{split}/state_nll": self.state_nll(batch).mean()}
+        self.log_dict(values, batch_size=len(batch.mask))
+
+
+def has_transition_density(process: Process) -> bool:
+    """Tell whether p(s_t | s_{t-1}, a) is a density; of certain steps it is not."""
+    zeros = torch.zeros(1, process.state_dim + process.action_dim)
+    state, action = zeros.split((process.state_dim, process.action_dim), -1)  # (1, D), (1, A)
+    return not isinstance(process.transition(state, action), PointMass)
+
+
+def _require_density(process: Process, objective: Objective) -> None:
+    """Refuse finite states, and the ELBO where there is no p(s_t | s_{t-1}, a) to put into it."""
+    name = type(process).__name__
+    if isinstance(process.initial(torch.zeros(1)), CategoricalBelief):
+        raise ForbesError(f"KnownBelief: the states of {name} are finite, expected a density. Train a WorldModel on it")
+    if objective == "elbo" and not has_transition_density(process):
+        raise ForbesError(
+            f"KnownBelief: the steps of {name} are certain, so log p(s_t | s_t-1) is no number, expected a density "
+            "for the objective elbo. Choose objective: state_nll"
+        )
+
+
+def _not_its_data(process: Process, found: str) -> ForbesError:
+    return ForbesError(
+        f"KnownBelief: the data are {found}, expected those of its {process}. Give model and data the "
+        "same process, as configs/pomdp does"
+    )

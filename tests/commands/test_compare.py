@@ -1,0 +1,297 @@
+"""`forbes compare`: trains, measures and puts side by side; interrupted, it goes on."""
+
+import contextlib
+import io
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from forbes.commands import compare as compare_command
+from forbes.commands.cli import main
+from forbes.evaluation.comparison import Comparison, Family, compare, markdown
+from forbes.evaluation.metrics import score_of
+from forbes.evaluation.record import read_arrays, read_record
+from forbes.figures.comparison import differences, per_step, scores
+
+ELBO = "test/elbo[bernoulli,S=2]"
+ONE_EPOCH = ["--", "--trainer.max_epochs", "1"]
+MEASURES = ["--samples", "2", "--particles", "2", "--futures", "2", "--context", "2"]
+
+
+def in_this_process(jobs, at_once):
+    return {job.name: main(job.command[job.command.index("fit") :]) for job in jobs}
+
+
+def configuration_in_this_process(config, *flags):
+    with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit, match="0"):
+        main(["fit", "--config", config, *flags, "--print_config"])
+    return printed.getvalue()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_process():
+    """A process of its own would spend most of a test on its imports."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compare_command, "run_jobs", in_this_process)
+        patch.setattr(compare_command, "_configuration", configuration_in_this_process)
+        yield
+
+
+@pytest.fixture(scope="module")
+def configs(tiny_config, tmp_path_factory):
+    """The tiny configuration, and one of an RSSM beside it."""
+    rssm = tmp_path_factory.mktemp("configs") / "rssm.yaml"
+    text = tiny_config.read_text().replace(
+        "{class_path: FlowBelief, init_args: {layers: 2, width: 4}}", "GaussianBelief"
+    )
+    rssm.write_text(text)
+    return [str(rssm), str(tiny_config)]
+
+
+@pytest.fixture(scope="module")
+def compared(configs, tmp_path_factory):
+    """The folder of a comparison of two families with two seeds each."""
+    folder = tmp_path_factory.mktemp("compared")
+    arguments = ["compare", *configs, "--seeds", "2", "-o", str(folder), *MEASURES]
+    assert main([*arguments, *ONE_EPOCH]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def families(compared):
+    return [Family(n, {seed: str(compared / f"{n}-{seed}") for seed in range(2)}, 9) for n in ("rssm", "forbes")]
+
+
+def test_every_configuration_is_trained_under_every_seed_with_the_flags(compared):
+    for name in ("rssm", "forbes"):
+        for seed in range(2):
+            provenance = json.loads((compared / f"{name}-{seed}" / "provenance.json").read_text())
+            assert str(seed) in json.dumps(provenance)
+            metrics = (compared / f"{name}-{seed}" / "metrics.jsonl").read_text().splitlines()
+            assert json.loads(metrics[-1])["update"] == 5  # one epoch instead of two
+
+
+def test_the_tables_hold_every_score_and_the_paired_differences_of_equal_seeds(compared):
+    table = pd.read_csv(compared / "comparison.csv")
+    assert set(table["family"]) == {"rssm", "forbes"}
+    assert {"elbo", "iwae", "pll", "fivo", "open_loop"} <= {name[5:].split("[")[0] for name in table["metric"]}
+
+    record = json.loads((compared / "comparison.json").read_text())
+    elbo = {row["seed"]: row for row in record["differences"] if row["metric"] == ELBO}
+    for seed in range(2):
+        forbes, rssm = (read_arrays(str(compared / f"{name}-{seed}"))[ELBO] for name in ("forbes", "rssm"))
+        assert elbo[seed]["mean"] == pytest.approx((forbes - rssm).mean())
+        assert elbo[seed]["standard_error"] == pytest.approx((forbes - rssm).std(ddof=1) / np.sqrt(len(rssm)))
+        assert f"{(forbes - rssm).mean():.2f} ±" in (compared / "comparison.md").read_text()
+
+
+def test_the_pictures_are_there_and_show_the_values(compared, families):
+    assert {path.name for path in compared.glob("*.png")} == {"scores.png", "per-step.png", "differences.png"}
+    comparison = compare(families, [ELBO])
+
+    (panel,) = scores(comparison).axes
+    own = comparison.scores.groupby("family", sort=False)["mean"]
+    bars = [line.get_xdata()[0] for line in panel.lines if len(line.get_xdata()) == 2 and line.get_marker() == "None"]
+    assert bars == pytest.approx(own.mean().tolist())
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["rssm", "forbes"]
+
+    (panel,) = per_step(comparison).axes
+    assert panel.lines[1].get_ydata() == pytest.approx(comparison.curves[ELBO]["forbes"])
+
+    (panel,) = differences(comparison, "rssm").axes
+    assert panel.texts[0].get_text() == f"{comparison.differences['mean'].mean():+.2f}"
+
+
+@pytest.fixture(scope="module")
+def vector(configs, tmp_path_factory):
+    """The configuration of a model without bounds."""
+    path = tmp_path_factory.mktemp("configs") / "vector.yaml"
+    flows = "{class_path: FlowBelief, init_args: {layers: 2, width: 4}}"
+    text = Path(configs[1]).read_text().replace(f"belief: {flows}", "model: VectorModel")
+    path.write_text(text.replace("state_dim: 2", "state_dim: 0"))
+    return str(path)
+
+
+def test_a_score_that_a_family_does_not_have_is_empty(configs, vector, compared, tmp_path):
+    folder = shutil.copytree(compared, tmp_path / "compared")
+
+    assert main(["compare", vector, *configs, "-o", str(folder), *MEASURES, *ONE_EPOCH]) == 0
+
+    table = pd.read_csv(folder / "comparison.csv").set_index(["metric", "family"])
+    pll = next(name for name in table.index.levels[0] if "/pll[" in name)
+    record = json.loads((folder / "comparison.json").read_text())  # which has no NaN
+    text = (folder / "comparison.md").read_text()
+    rows = {
+        line.split("|")[1].strip(" `"): line for line in text.split("Models without")[0].splitlines() if line[:1] == "|"
+    }
+    assert np.isnan(table.loc[(ELBO, "vector"), "mean"])
+    assert np.isfinite(table.loc[(pll, "vector"), "mean"])
+    assert table.loc[(ELBO, "vector"), "parameters"] == table.loc[(pll, "vector"), "parameters"] > 0
+    blank = [row for row in record["scores"] if row["mean"] is None]
+    assert {row["family"] for row in blank} == {"vector"}
+    assert ELBO in {row["metric"] for row in blank}
+    assert "n/a" in rows[ELBO]
+    assert "n/a" not in rows[pll]
+    assert {score_of(row["metric"]) for row in record["differences"]} == {"pll", "open_loop"}
+
+    families = [Family(n, {0: str(folder / f"{n}-0")}, 9, lacks) for n, lacks in [("rssm", []), ("vector", [ELBO])]]
+    comparison = compare(families, [ELBO, pll])
+    elbo, of_pll = per_step(comparison).axes
+    assert [line.get_label() for line in elbo.lines] == ["rssm"]
+    assert {line.get_label(): line.get_color() for line in of_pll.lines}["rssm"] == elbo.lines[0].get_color()
+    legend = per_step(comparison).legends[0]
+    assert [entry.get_text() for entry in legend.get_texts()] == ["rssm", "vector"]
+
+
+def test_a_family_far_below_the_others_stands_at_the_edge_in_words_and_the_known_likelihood_is_drawn():
+    means = {"a": -1.0, "b": -1.2, "c": -1.1, "far": -40.0}
+    rows = [(f, "test/elbo[S=1]", v) for f, v in means.items()] + [(f, "test/log_p[exact]", -0.5) for f in means]
+    table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
+
+    (panel,) = scores(Comparison(table, table, {}, {})).axes
+
+    assert [text.get_text() for text in panel.texts] == ["← −40.0"]
+    assert panel.get_xlim()[0] > -3
+    assert panel.lines[-1].get_xdata()[0] == -0.5
+
+
+def test_a_difference_that_two_families_do_not_have_says_so():
+    rows = [("a", "test/elbo[S=1]", 1.0), ("a", "test/pll[K=1]", 2.0), ("b", "test/pll[K=1]", -1.0)]
+    table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
+
+    (panel,) = differences(Comparison(table, table, {}, {}), "first").axes
+
+    assert [text.get_text() for text in panel.texts] == ["+1.00", "+2.00", "n/a", "-1.00"]
+
+
+def test_given_again_it_trains_and_measures_nothing(configs, compared, monkeypatch, capfd):
+    measured = []
+    monkeypatch.setattr(compare_command, "evaluate", lambda *arguments: measured.append(arguments))
+    before = {path: path.read_bytes() for path in compared.rglob("evaluation.json")}
+
+    assert main(["compare", *configs, "--seeds", "2", "-o", str(compared), *MEASURES, *ONE_EPOCH]) == 0
+
+    assert measured == []
+    assert {path: path.read_bytes() for path in compared.rglob("evaluation.json")} == before
+
+
+def test_other_noise_is_measured_anew(configs, compared, tmp_path):
+    folder = shutil.copytree(compared, tmp_path / "compared")
+    command = ["compare", *configs, "--scores", "elbo", "-o", str(folder), *MEASURES, "--seed", "1", *ONE_EPOCH]
+
+    assert main(command) == 0
+
+    for run, other in [(folder / "rssm-0", compared / "rssm-0"), (folder / "forbes-0", compared / "forbes-0")]:
+        assert json.loads((run / "evaluation.json").read_text())[ELBO]["seed"] == 1
+        assert not np.array_equal(read_arrays(str(run))[ELBO], read_arrays(str(other))[ELBO])
+
+
+def test_it_goes_on_where_it_was_stopped(configs, tmp_path, monkeypatch):
+    """Killed in the second training, then between the measurement of one run and that of another."""
+    command = ["compare", *configs, "--scores", "elbo", "-o", str(tmp_path), *MEASURES, *ONE_EPOCH]
+    measure = compare_command.evaluate
+
+    def killed_in_the_second(jobs, at_once):
+        return in_this_process(jobs[:1], at_once) | {jobs[1].name: 143}
+
+    monkeypatch.setattr(compare_command, "run_jobs", killed_in_the_second)
+    assert main(command) == 2
+    monkeypatch.setattr(compare_command, "run_jobs", in_this_process)
+    monkeypatch.setattr(compare_command, "evaluate", lambda runs, *rest: measure(runs[:1], *rest) and 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(command)
+    measured = []
+    monkeypatch.setattr(compare_command, "evaluate", lambda runs, *rest: measured.append(runs) or measure(runs, *rest))
+
+    assert main(command) == 0
+
+    assert measured == [[str(tmp_path / "forbes-0")]]
+    assert len((tmp_path / "comparison.md").read_text().splitlines()) > 4
+    for name in ("rssm", "forbes"):
+        metrics = (tmp_path / f"{name}-0" / "metrics.jsonl").read_text().splitlines()
+        assert json.loads(metrics[-1])["update"] == 5
+
+
+@pytest.mark.parametrize("scores", [["elbo"], ["fivo"]])
+def test_a_family_without_any_of_the_scores_has_a_row_of_its_own(scores, configs, vector, compared, tmp_path, capsys):
+    folder = shutil.copytree(compared, tmp_path / "compared")
+
+    assert main(["compare", configs[0], vector, "-o", str(folder), "--scores", *scores, *MEASURES, *ONE_EPOCH]) == 0
+
+    table = pd.read_csv(folder / "comparison.csv").set_index("family")
+    assert table.loc["vector", "mean"].isna().all()
+    assert table.loc["rssm", "mean"].notna().all()
+    assert (table.loc["vector", "parameters"] > 0).all()
+    assert (folder / "per-step.png").exists()
+
+
+def test_the_degradation_is_what_the_open_loop_loses_step_by_step(compared, families):
+    metrics = list(pd.read_csv(compared / "comparison.csv")["metric"].unique())
+
+    comparison = compare(families, metrics)
+
+    (degradation,) = [metric for metric in comparison.curves if score_of(metric) == "degradation"]
+    pll, marginal = (
+        next(metric for metric in metrics if score_of(metric) == name) for name in ("pll", "open_loop_marginal")
+    )
+    for name in ("rssm", "forbes"):
+        records = [read_record(run) for run in runs_of(families, name)]
+        closed, opened = (np.mean([record[metric]["curve"] for record in records], 0) for metric in (pll, marginal))
+        expected = np.where(np.arange(len(closed)) < 2, 0, closed - opened)
+        assert comparison.curves[degradation][name] == pytest.approx(expected.tolist())
+    text = markdown(comparison, families)
+    assert f"`{degradation}`" in text
+    assert f"| forbes | {comparison.curves[degradation]['forbes'][2]:.2f} |" in text
+    assert len(per_step(comparison).axes) == 5
+
+
+def runs_of(families, name):
+    return next(family for family in families if family.name == name).runs.values()
+
+
+def test_references_stand_below_the_table_and_in_the_picture(compared, families):
+    metrics = list(pd.read_csv(compared / "comparison.csv")["metric"].unique())
+
+    comparison = compare(families, metrics)
+
+    bounds = [metric for metric in metrics if score_of(metric) in ("elbo", "iwae", "pll", "fivo", "open_loop")]
+    assert [*comparison.references] == bounds
+    names = [f"{order}-gram" for order in range(1, 6)]
+    assert all([*means] == names for means in comparison.references.values())
+    text = markdown(comparison, families)
+    means = comparison.references[ELBO]
+    assert f"| `{ELBO}` | " + " | ".join(f"{mean:.2f}" for mean in means.values()) in text
+    lowest = min(names, key=means.__getitem__)
+    (row,) = [line for line in text.splitlines() if line.startswith(f"| `{ELBO}` |") and "<" in line]
+    assert row.count(f"< {lowest}") == 2  # hardly trained: below all of them
+    axes = scores(comparison._replace(references={ELBO: {"near": -1e3, "far": 1e9}})).axes[0]
+    assert [text.get_text() for text in axes.texts if "near" in text.get_text() or "far" in text.get_text()] == []
+
+
+def test_a_run_that_was_trained_otherwise_is_refused(configs, compared, capsys):
+
+    assert main(["compare", *configs, "-o", str(compared), *MEASURES]) == 2
+
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "rssm-0: was trained with trainer.max_epochs = 1, expected 2. Give the configuration" in error
+
+
+def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_path, capsys):
+    def error_of(*arguments):
+        capsys.readouterr()
+        assert main(["compare", *arguments, "-o", str(tmp_path)]) == 2
+        return capsys.readouterr().err.splitlines()[-1]
+
+    assert "absent.yaml: no such configuration" in error_of("absent.yaml")
+    twin = tmp_path / "rssm.yaml"
+    twin.write_text(Path(configs[0]).read_text())
+    assert "another configuration is called rssm" in error_of(configs[0], str(twin))
+    failed = error_of(configs[0], "--", "--model.no_such_key", "1")
+    assert "trainings that failed: " in failed
+    assert "rssm-0 with status 2" in failed
+    with pytest.raises(Exception, match=r"rssm-0: evaluation.json has no test/bleu"):
+        compare(families, ["test/bleu"])

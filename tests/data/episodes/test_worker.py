@@ -1,0 +1,165 @@
+"""Episodes that another process plays: the same as here, by the policy as it was, and every failure is said."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from processes import ends
+from toy_environments import Parrot, Troubled
+
+from forbes.data.episodes.collection import play
+from forbes.data.episodes.worker import Player
+from forbes.errors import ForbesError
+
+
+class Said:
+    """Says what its tensor holds, at every step."""
+
+    def __init__(self, number):
+        self.number = torch.full((1,), number)
+
+    def __call__(self, environment, seed):
+        return lambda observation: self.number.numpy()
+
+
+@pytest.fixture(scope="module")
+def player():
+    with closing(Player(partial(Parrot, steps=8))) as player:
+        yield player
+
+
+def test_the_episode_is_that_of_this_process(player):
+    player.begin(Said(0.5), number=0, seed=3)
+
+    for ours, theirs in zip(player.finish(), play(Parrot(8), Said(0.5)(None, 3), 3), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_policy_does_not_change_while_it_plays(player):
+    """Tensors sent through a pipe in torch's own way share their memory."""
+    policy = Said(0.5)
+    player.begin(policy, number=0, seed=3)
+    policy.number.fill_(0.25)
+
+    assert (player.finish().action[1:] == 0.5).all()
+
+
+def test_one_episode_after_another(player):
+    for number in range(3):
+        player.begin(Said(number / 4), number, seed=number)
+        assert player.finish().action[-1] == number / 4
+
+
+def test_a_broken_episode_is_played_again(tmp_path):
+    with closing(Player(partial(Troubled, "raises", tmp_path / "ledger"))) as player:
+        player.begin(Said(0.5), number=0, seed=0)
+        assert len(player.finish().action) == 7
+
+
+@pytest.mark.parametrize("trouble", ["raises", "hangs"])
+def test_an_environment_that_breaks_each_time_is_named(trouble, tmp_path):
+    timeout = 1.0 if trouble == "hangs" else 60.0
+    with closing(Player(partial(Troubled, trouble, tmp_path / "ledger", times=9), timeout)) as player:
+        player.begin(Said(0.5), number=4, seed=0)
+        with pytest.raises(ForbesError, match=f"{trouble}.* so broke episode 4 3 times, nothing of it is stored"):
+            player.finish()
+
+
+class Kills(Said):
+    """Is the end of whoever asks it."""
+
+    def __call__(self, environment, seed):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_player_that_dies_each_time_is_named():
+    with closing(Player(partial(Parrot, steps=8))) as player:
+        player.begin(Kills(0.5), number=4, seed=0)
+        with pytest.raises(ForbesError, match="has died, exit code -9, 3 times in episode 4; what it said is above"):
+            player.finish()
+
+
+def test_a_killed_player_is_started_again_and_plays_the_same_episode(capfd):
+    """Killed between two episodes."""
+    with closing(Player(partial(Parrot, steps=8))) as player:
+        os.kill(player._process.pid, signal.SIGKILL)
+        player._process.join()
+        player.begin(Said(0.5), number=4, seed=3)
+        for ours, theirs in zip(player.finish(), play(Parrot(8), Said(0.5)(None, 3), 3), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+    assert "has died, exit code -9; episode 4 is played again" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_a_player_that_starts_is_left_to_its_parent(number, capfd):
+    """As a terminal sends it to the whole group: before Python has begun in the new process."""
+    with closing(Player(partial(Parrot, steps=8))) as player:
+        os.kill(player._process.pid, number)
+        player.begin(Said(0.5), number=0, seed=3)
+        assert len(player.finish().action) == 9
+
+    assert capfd.readouterr().err == ""
+
+
+class SlowToImport:
+    """Makes an environment, in a process that imports what it needs for an hour."""
+
+    def __reduce__(self):
+        return time.sleep, (3600,)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+@pytest.mark.parametrize("kind", ["forbes.data.episodes.worker.Player", "forbes.envs.EnvironmentProcess"])
+def test_a_process_that_still_imports_ends_with_its_parent(tmp_path, kind):
+    module, _, name = kind.rpartition(".")
+    program = f"""
+import multiprocessing, threading, time
+from {module} import {name}
+from test_worker import SlowToImport
+if __name__ == "__main__":
+    threading.Thread(target={name}, args=(SlowToImport(),), daemon=True).start()
+    while not (children := multiprocessing.active_children()):
+        time.sleep(0.01)
+    time.sleep(2)
+    print(children[0].pid, flush=True)
+    time.sleep(3600)
+"""
+    (tmp_path / "parent.py").write_text(program)
+    paths = os.pathsep.join([os.path.dirname(__file__), *filter(None, sys.path)])
+    command, environ = [sys.executable, str(tmp_path / "parent.py")], os.environ | {"PYTHONPATH": paths}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environ) as parent:
+        child = int(parent.stdout.readline())
+        parent.kill()
+
+    if not (ended := ends(child)):
+        os.kill(child, signal.SIGKILL)
+    assert ended
+
+
+class Told(Said):
+    """Says in a file which process its environment is."""
+
+    def __call__(self, environment, seed):
+        self.path.write_text(str(environment.describe()["process"]))
+        return super().__call__(environment, seed)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_nothing_is_left_of_a_player_closed_in_the_midst_of_an_episode(tmp_path):
+    ledger, policy = tmp_path / "ledger", Told(0.5)
+    policy.path = tmp_path / "process"
+    player = Player(partial(Troubled, "hangs", ledger))
+    player.begin(policy, number=0, seed=0)
+    while not ledger.exists():  # it has begun to hang
+        time.sleep(0.05)
+    player.close()
+
+    assert ends(int(policy.path.read_text()))
