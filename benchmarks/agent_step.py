@@ -106,7 +106,7 @@ class Work:
             setattr(self.agent, name, lambda *_, **__: None)
         self.data, self.device, self.number, self.half = data, device, 0, half
         self.optimizer = self.agent.configure_optimizers()["optimizer"]
-        self.acting = Agent(self.agent.model, self.agent.choose(exploring=True), seed=0)
+        self.acting = Agent(self.agent.model, self.agent.action_selector(exploring=True), seed=0)
         self.batch = self.loading()
         with torch.no_grad():
             _, self.filtered = self.agent.follow(self.batch)

@@ -16,7 +16,7 @@ import torch
 from train_step import common_options, conditions, experiment, publish, say
 
 from forbes.data import SequenceDataModule
-from forbes.evaluation.scoring import make_pass, score_split
+from forbes.evaluation.scoring import make_scorer, score_split
 from forbes.models import BeliefModel
 
 SCORES = ("pll", "fivo")
@@ -25,7 +25,7 @@ DIGITS, PARTICLES = 1000, 128  # of the extrapolation
 
 def seconds(model: BeliefModel, data: SequenceDataModule, name: str, digits: int, particles: int) -> float:
     """Score so many test digits as `forbes evaluate` does, and give the seconds of the processor."""
-    score = make_pass(name, particles, data.batch_size, context=10)
+    score = make_scorer(name, particles, data.batch_size, context=10)
     batches = ((int(index[0]), data.sequences("test", index)) for index in torch.arange(digits).split(score.batch_size))
     start = time.process_time()
     score_split(model, batches, score)

@@ -94,7 +94,7 @@ class Textbook(nn.Module):
         del self.model.prior, self.model.posterior
 
     def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
-        """Estimate the bound as `StateSpaceModel.elbo` does."""
+        """Estimate the bound as `StateSpaceModel.lower_bound` does."""
         model = self.model
         embedding = model.embed(observation)
         hidden, state = model.initial(len(embedding))

@@ -91,7 +91,7 @@ class Update:
 
     def eager_loss(self) -> Tensor:
         """Give the training loss."""
-        terms = self.model.elbo(self.batch.observation, self.batch.action, self.batch.mask)
+        terms = self.model.lower_bound(self.batch.observation, self.batch.action, self.batch.mask)
         return elbo_loss(terms, self.world.free_nats, self.world.free_nats_per)
 
     def loss_of_noise(self, seed: int) -> float:

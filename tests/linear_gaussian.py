@@ -82,7 +82,7 @@ def bounds(model, observation, samples):
     stored = (observation.float() + 0.5).expand(samples, *observation.shape).unflatten(-1, (1, 1, 3))  # (N, T, 1, 1, 3)
     action, mask = torch.zeros(*stored.shape[:2], 0), torch.ones(*stored.shape[:2], dtype=torch.bool)
     with torch.no_grad():
-        return model.elbo(stored, action, mask).elbo.double()
+        return model.lower_bound(stored, action, mask).elbo.double()
 
 
 def observations(steps, seed):

@@ -26,7 +26,7 @@ from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.data.strokes.file import load_strokes, save_strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.record import write_record
-from forbes.evaluation.scoring import Parts
+from forbes.evaluation.scoring import PartialScores
 from forbes.figures.style import save_figure
 from forbes.files import append_whole, locked, replace_file
 from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
@@ -88,7 +88,7 @@ WRITERS = {
     "000000.npz": lambda folder, _: append_episodes(folder, steps=1000),
     "index.jsonl": lambda folder, _: append_episodes(folder),
     "evaluation.npz": lambda folder, _: write_record(folder, {"elbo": {"mean": 1.0}}, {"elbo": MANY}),
-    "0.npz": lambda folder, _: Parts(folder, "key").write(0, {"elbo": MANY}),
+    "0.npz": lambda folder, _: PartialScores(folder, "key").write(0, {"elbo": MANY}),
     "figure.pdf": lambda folder, _: plot(folder, save_figure, "figure.pdf"),
     "strokes.npz": save_all_strokes,
 }

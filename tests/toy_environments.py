@@ -221,7 +221,7 @@ class Slide(Environment):
         return {"task": "Slide", "steps": self.steps}
 
 
-class Measured(DeepMindControl):
+class EvaluatedRun(DeepMindControl):
     """Says how large the buffer is that it renders into."""
 
     def describe(self):

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from forbes.configured import Configurable
 from forbes.frozen import frozen
-from forbes.performance.time_loop import Loop
+from forbes.performance.time_loop import TimeLoop
 
 __all__ = ["BeliefFamily", "BeliefHead", "Sampler"]
 
@@ -60,7 +60,7 @@ class BeliefHead(Configurable, nn.Module, ABC):
         with frozen(self):
             return self.log_prob(state, context.detach())
 
-    def sampler(self, loop: Loop) -> Sampler:
+    def sampler(self, loop: TimeLoop) -> Sampler:
         """Prepare `rsample` for a time loop: what does not depend on the context is computed once, here.
 
         A family may bind its weights to the loop (see `forbes.performance.time_loop`); the default does not.

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.errors import ForbesError
-from forbes.performance.time_loop import Loop
+from forbes.performance.time_loop import TimeLoop
 
 __all__ = ["CategoricalBelief", "draw_one_hot", "one_hot_of"]
 
@@ -54,7 +54,7 @@ class CategoricalBelief(BeliefHead):
         """See `BeliefHead.rsample`; the gradient is straight-through."""
         return draw_one_hot(self.log_probabilities(context), sample_shape)
 
-    def sampler(self, loop: Loop) -> Sampler:
+    def sampler(self, loop: TimeLoop) -> Sampler:
         """See `BeliefHead.sampler`."""
         logits_of = loop.affine(self.logits_of.weight, self.logits_of.bias)
         return lambda context: draw_one_hot(self._log_probabilities(logits_of(context)))

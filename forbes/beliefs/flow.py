@@ -10,7 +10,7 @@ from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.beliefs.coupling import AffineCoupling, ConditionalFlow
 from forbes.beliefs.gaussian import GaussianBelief
 from forbes.beliefs.splines import SplineCoupling
-from forbes.performance.time_loop import Loop
+from forbes.performance.time_loop import TimeLoop
 
 __all__ = ["FlowBelief"]
 
@@ -66,7 +66,7 @@ class FlowBelief(BeliefHead):
         base, log_det = self.flow.inverse(state, context)
         return self.base.log_prob(base, context) - log_det
 
-    def sampler(self, loop: Loop) -> Sampler:
+    def sampler(self, loop: TimeLoop) -> Sampler:
         """See `BeliefHead.sampler`."""
         base, generate = self.base.sampler(loop), self.flow.generator(loop.affine)
 

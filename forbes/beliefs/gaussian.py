@@ -8,7 +8,7 @@ from torch.nn.functional import softplus
 
 from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.performance.fusion import fused
-from forbes.performance.time_loop import Loop
+from forbes.performance.time_loop import TimeLoop
 
 __all__ = ["GaussianBelief", "standard_normal_log_prob"]
 
@@ -48,7 +48,7 @@ class GaussianBelief(BeliefHead):
         """See `BeliefHead.rsample`."""
         return _place(self.parameters_of(context), self._noise(context, sample_shape), self.min_std)
 
-    def sampler(self, loop: Loop) -> Sampler:
+    def sampler(self, loop: TimeLoop) -> Sampler:
         """See `BeliefHead.sampler`."""
         place = loop.affine(self.parameters_of.weight, self.parameters_of.bias, _place)
         return lambda context: place(context, self._noise(context), self.min_std)

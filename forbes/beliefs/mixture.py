@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.base import BeliefHead, Sampler
-from forbes.performance.time_loop import Loop
+from forbes.performance.time_loop import TimeLoop
 from forbes.shapes import printed_by_shape
 
 __all__ = ["Mixture", "MixtureBelief"]
@@ -77,7 +77,7 @@ class MixtureBelief(BeliefHead):
         """See `BeliefHead.log_prob`."""
         return self.mixture(context).log_prob(state)
 
-    def sampler(self, loop: Loop) -> Sampler:
+    def sampler(self, loop: TimeLoop) -> Sampler:
         """See `BeliefHead.sampler`."""
         parameters_of = loop.affine(self.parameters_of.weight, self.parameters_of.bias)
         return lambda context: _draw(self._mixture(parameters_of(context)))

@@ -14,10 +14,10 @@ from forbes.data import Experience
 from forbes.data.episodes.collection import random_policy
 from forbes.data.episodes.episode import Episode
 from forbes.errors import ForbesError
-from forbes.evaluation.reward_prediction import foretell, share_explained
+from forbes.evaluation.reward_prediction import predict_rewards, r2_score
 from forbes.files import require_room
 from forbes.seeding import derive_seed
-from forbes.training.acting import Acting, ActingModel, play_measured
+from forbes.training.acting import AgentPolicy, WorldModelAgent, play_measured
 
 __all__ = ["Collect", "require_agent"]
 
@@ -82,7 +82,7 @@ class Collect(Callback):
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play what is missing."""
-        source, agent = _experience(trainer), cast(ActingModel, pl_module)
+        source, agent = _experience(trainer), cast(WorldModelAgent, pl_module)
         if trainer.current_epoch == 0:  # a start that was cut off in its first epoch has left no checkpoint to say so
             source.watermark = source.begun("random", agent.seed, self.seed_episodes)
         else:  # nor would a run that goes on from the checkpoint draw from what is forgotten now
@@ -91,7 +91,7 @@ class Collect(Callback):
             _say(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
         with _eval_mode(agent):
             until = self.seed_episodes + trainer.current_epoch
-            list(source.collect(until, Acting(agent, exploring=True), type(agent).__name__, agent.seed))
+            list(source.collect(until, AgentPolicy(agent, exploring=True), type(agent).__name__, agent.seed))
         _warn_of_ends(source, agent)
         self._estimate_room(trainer)
         steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
@@ -109,12 +109,12 @@ class Collect(Callback):
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         """Let the next episode be played, now that other callbacks have played theirs."""
         if self.overlap and batch_idx == 0:
-            agent = cast(ActingModel, pl_module)
-            _experience(trainer).begin(Acting.as_it_is(agent, exploring=True), agent.seed)
+            agent = cast(WorldModelAgent, pl_module)
+            _experience(trainer).begin(AgentPolicy.as_it_is(agent, exploring=True), agent.seed)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Store the episode played meanwhile; measure the agent every few epochs, and at the end."""
-        agent, source = cast(ActingModel, pl_module), _experience(trainer)
+        agent, source = cast(WorldModelAgent, pl_module), _experience(trainer)
         if self.overlap:
             source.finish(type(agent).__name__, agent.seed)
         number = trainer.current_epoch + 1
@@ -124,23 +124,23 @@ class Collect(Callback):
             played = [self.evaluation_episode(trainer, agent, k) for k in range(self.evaluation_episodes)]
             told = [self._foretold(agent, episode, k) for k, episode in enumerate(played)]
         agent.log("return/acting", sum(episode.total_reward for episode in played) / len(played), batch_size=1)
-        share = share_explained(told, [torch.from_numpy(episode.reward[1:]).double() for episode in played])
+        share = r2_score(told, [torch.from_numpy(episode.reward[1:]).double() for episode in played])
         if share is not None:
             agent.log(f"reward_explained/{_AHEAD}", share, batch_size=1)
 
     @staticmethod
-    def _foretold(agent: ActingModel, episode: Episode, number: int) -> Tensor:
+    def _foretold(agent: WorldModelAgent, episode: Episode, number: int) -> Tensor:
         seed = derive_seed(agent.seed, "foresight", number)
-        return foretell(agent, episode, seed, f"evaluation episode {number}", (_AHEAD,))[0]
+        return predict_rewards(agent, episode, seed, f"evaluation episode {number}", (_AHEAD,))[0]
 
-    def evaluation_episode(self, trainer: Trainer, agent: ActingModel, number: int) -> Episode:
+    def evaluation_episode(self, trainer: Trainer, agent: WorldModelAgent, number: int) -> Episode:
         """Play one of the episodes that measure an agent, in eval mode, while it learns: the same each time."""
         return play_measured(agent, _experience(trainer).environment, "evaluation", agent.seed, number)
 
 
-def _warn_of_ends(source: Experience, agent: ActingModel) -> None:
+def _warn_of_ends(source: Experience, agent: WorldModelAgent) -> None:
     """Say so where episodes end by themselves, and the agent imagines that they do not."""
-    if source.newest.terminated and not agent.foresees_ends:
+    if source.newest.terminated and not agent.predicts_termination:
         warnings.warn(
             f"{source.task}: an episode has ended by itself, and this {type(agent).__name__} imagines that none does. "
             "An ImaginationActorCritic foresees it with --model.continuation true",
@@ -149,7 +149,7 @@ def _warn_of_ends(source: Experience, agent: ActingModel) -> None:
 
 
 @contextmanager
-def _eval_mode(agent: ActingModel) -> Iterator[None]:
+def _eval_mode(agent: WorldModelAgent) -> Iterator[None]:
     training = agent.training
     agent.eval()
     yield
@@ -164,7 +164,7 @@ def _experience(trainer: Trainer) -> Experience:
 def require_agent(callback: Callback, trainer: Trainer, module: LightningModule) -> None:
     """Raise a ForbesError unless an agent learns on Experience."""
     source = trainer.datamodule.source  # type: ignore[attr-defined]
-    if not (isinstance(source, Experience) and isinstance(module, ActingModel)):
+    if not (isinstance(source, Experience) and isinstance(module, WorldModelAgent)):
         name, found = type(callback).__name__, f"{type(module).__name__} on {type(source).__name__}"
         raise ForbesError(f"{name}: found a {found}, expected an agent on Experience. Leave it out, or change them")
 

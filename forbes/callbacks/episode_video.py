@@ -10,7 +10,7 @@ from forbes.callbacks.picture import FileCallback, require_frames
 from forbes.data import SequenceDataModule
 from forbes.figures.video import gif
 from forbes.files import replace_file
-from forbes.training.acting import ActingModel
+from forbes.training.acting import WorldModelAgent
 from forbes.training.world_model import WorldModel
 
 __all__ = ["EpisodeVideo"]
@@ -40,5 +40,5 @@ class EpisodeVideo(FileCallback):
         """See `FileCallback`."""
         callbacks = trainer.callbacks  # type: ignore[attr-defined]  # Lightning gives it no type
         collect = next(callback for callback in callbacks if isinstance(callback, Collect))
-        episode = collect.evaluation_episode(trainer, cast(ActingModel, module), 0)
+        episode = collect.evaluation_episode(trainer, cast(WorldModelAgent, module), 0)
         replace_file(path, gif([episode.observation]))

@@ -14,7 +14,7 @@ from forbes.data.episodes.store import EpisodeWriter
 from forbes.envs import Environment, EnvironmentProcess, find_environment
 from forbes.errors import ForbesError
 from forbes.files import require_room
-from forbes.training.acting import Acting
+from forbes.training.acting import AgentPolicy
 from forbes.training.loading import loaded_agent
 
 __all__ = ["collect"]
@@ -57,7 +57,7 @@ def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, M
                 f"--policy {policy}: an agent acts in the environment of its run, expected no {flag}. Leave it out"
             )
         with loaded_agent(policy, "cpu") as (agent, environment, _):
-            yield environment, Acting(agent, exploring=True)
+            yield environment, AgentPolicy(agent, exploring=True)
     elif "task" not in given:
         raise ForbesError(f"--policy {_RANDOM}: needs an environment. Name one: --task TASK")
     else:

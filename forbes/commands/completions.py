@@ -8,7 +8,7 @@ import pandas as pd
 
 from forbes.commands.parsers.completions import parser
 from forbes.data import Strokes
-from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, load_judges
+from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, load_classifiers
 from forbes.errors import ForbesError
 from forbes.evaluation.digits.completions import prefixes
 from forbes.evaluation.digits.study import Study, entries, print_study, study
@@ -32,7 +32,7 @@ def main(argv: Sequence[str]) -> None:
     hashes = [data_sha256(run.data, args.split, args.sequences) for run in runs]
     require_comparable(runs, hashes)
     assert isinstance(data.source, Strokes)
-    judges = load_judges(data.source.origin)
+    judges = load_classifiers(data.source.origin)
     named = dict(zip(run_titles(runs), runs, strict=True))
     studies = []
     for context in sorted(set(args.prefixes)):

@@ -18,7 +18,7 @@ from forbes.data import Simulated
 from forbes.errors import ForbesError
 from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.estimates import Estimate
-from forbes.evaluation.metrics import SCORES, Measured, note, pair
+from forbes.evaluation.metrics import SCORES, EvaluatedRun, note, pair
 from forbes.evaluation.record import describe, require_readable, results_folders, write_record
 from forbes.evaluation.references import references
 from forbes.evaluation.round_trip import model_round_trip, print_round_trip
@@ -31,7 +31,7 @@ from forbes.evaluation.runs import (
     require_comparable,
     split_batches,
 )
-from forbes.evaluation.scoring import Parts, Pass, exact_pass, make_pass, score_split, with_progress
+from forbes.evaluation.scoring import PartialScores, Scorer, exact_scorer, make_scorer, score_split, with_progress
 from forbes.runs.provenance import command_line, commit
 
 __all__ = ["evaluate", "main", "wanted_metrics"]
@@ -41,7 +41,7 @@ class _Job(NamedTuple):
     """A pass over the first so many sequences of a split."""
 
     name: str
-    score: Pass
+    score: Scorer
     sequences: int
     sha256: list[str]
     """Of the sequences, as each run's data give them."""
@@ -68,7 +68,7 @@ def main(argv: Sequence[str]) -> None:
 
 def evaluate(
     paths: Sequence[str], args: Any, command: str, folders: Mapping[str, Path] | None = None
-) -> list[Measured]:
+) -> list[EvaluatedRun]:
     """Measure runs on the same sequences and record it.
 
     Args:
@@ -81,10 +81,10 @@ def evaluate(
     require_readable(folders.values())
     runs = load_runs(paths, find_device(args.device))
     jobs = _jobs(args, runs)
-    finished: list[Parts] = []
+    finished: list[PartialScores] = []
     measured = []
     for number, run in enumerate(runs):
-        one = Measured(run, {}, {})
+        one = EvaluatedRun(run, {}, {})
         for job in _of(run, jobs):
             finished.append(_measure(one, job, job.sha256[number], args, folders[run.path]))
         _add_references(one, jobs, args.split)
@@ -101,7 +101,7 @@ def evaluate(
     return measured
 
 
-def _add_references(one: Measured, jobs: Sequence[_Job], split: Split) -> None:
+def _add_references(one: EvaluatedRun, jobs: Sequence[_Job], split: Split) -> None:
     """Put beside each score what references have on the same steps of the same sequences."""
     found: dict[int, dict[str, Tensor]] = {}
     for job in _of(one.run, jobs):
@@ -132,7 +132,7 @@ def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
     """Say which passes to make, on how many sequences; refuse runs that cannot be compared there."""
     numbers = {name: getattr(args, option) for name, option in PASSES.items()}
     wanted = {
-        name: make_pass(name, numbers[name], args.batch_size, args.context) for name in PASSES if name in args.scores
+        name: make_scorer(name, numbers[name], args.batch_size, args.context) for name in PASSES if name in args.scores
     }
     if not any(score.of(run.model).metrics for run in runs for score in wanted.values()):
         raise ForbesError(
@@ -140,9 +140,9 @@ def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
             "Ask for --scores pll or open-loop"
         )
     for run, name in itertools.product(runs, [name for name in ("pll", "open-loop") if name in wanted]):
-        run.model.draws(numbers[name])  # a number that cannot be is said before minutes are spent
+        run.model.num_belief_samples(numbers[name])  # a number that cannot be is said before minutes are spent
     if isinstance(source := runs[0].data.source, Simulated):
-        wanted = {"exact": exact_pass(source.process)} | wanted
+        wanted = {"exact": exact_scorer(source.process)} | wanted
     hashes: dict[int, list[str]] = {}
     jobs = []
     for name, score in wanted.items():
@@ -213,10 +213,12 @@ def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
     return f"{split}{part}/{metric}[{tag}]"
 
 
-def _measure(one: Measured, job: _Job, sha256: str, args: Any, folder: Path) -> Parts:
+def _measure(one: EvaluatedRun, job: _Job, sha256: str, args: Any, folder: Path) -> PartialScores:
     """Make a pass for a run and add what it finds; give the parts it has left, to be removed in the end."""
     run, score = one.run, job.score
-    parts = Parts(folder / "evaluation-parts", run.checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed)
+    parts = PartialScores(
+        folder / "evaluation-parts", run.checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed
+    )
     began = time.monotonic()
     batches = split_batches(run.data, args.split, job.sequences, score.batch_size)
     batches = with_progress(batches, f"{run.path} {job.name}", job.sequences)

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from forbes.evaluation.estimates import Estimate
-from forbes.evaluation.metrics import Measured, Pair, at_horizons, degradation
+from forbes.evaluation.metrics import EvaluatedRun, Pair, at_horizons, degradation
 from forbes.evaluation.references import lowest_above
 
 __all__ = ["beaten_by", "print_degradation", "print_pairs", "print_references", "print_runs"]
@@ -20,7 +20,7 @@ _PIPE = 200
 """Columns where there is no terminal: rich would take 80."""
 
 
-def print_runs(measured: Sequence[Measured]) -> None:
+def print_runs(measured: Sequence[EvaluatedRun]) -> None:
     """Print every metric of every run; n/a where its model does not have it."""
     console = _console()
     for number, one in enumerate(measured, start=1):
@@ -33,7 +33,7 @@ def print_runs(measured: Sequence[Measured]) -> None:
     _print(console, "nats per sequence, mean ± standard error; ess as a share of K", columns)
 
 
-def print_references(measured: Sequence[Measured]) -> None:
+def print_references(measured: Sequence[EvaluatedRun]) -> None:
     """Print what the references score on the same sequences, and explain the marks of `print_runs`."""
     columns: dict[str, dict[str, str]] = {}
     for name, entry in itertools.chain.from_iterable(one.entries.items() for one in measured):
@@ -66,7 +66,7 @@ def print_pairs(pairs: Sequence[Pair]) -> None:
     _print(_console(), "paired differences over the same sequences, nats per sequence (in standard errors)", columns)
 
 
-def print_degradation(measured: Sequence[Measured]) -> None:
+def print_degradation(measured: Sequence[EvaluatedRun]) -> None:
     """Print what the open loop loses to the closed one, for every run that has both scores."""
     curves: dict[str, dict[str, list[float]]] = {}
     for one in measured:

@@ -14,9 +14,9 @@ from forbes.control.policy import Actor, Policy
 from forbes.models import Filtered, State, StateSpaceModel
 from forbes.seeding import derive_seed
 
-__all__ = ["Agent", "Choice", "explore", "follow_plan", "noisy", "take_mode"]
+__all__ = ["ActionSelector", "Agent", "explore", "follow_plan", "greedy", "noisy"]
 
-Choice: TypeAlias = Callable[[Filtered], Tensor]
+ActionSelector: TypeAlias = Callable[[Filtered], Tensor]
 """What to do at the last step of K filtered trajectories, `(K, 1, …)`: an action, `(1, A)`, in [-1, 1] or one-hot."""
 
 
@@ -30,13 +30,13 @@ class Agent:
 
     Args:
         model: in eval mode.
-        choose: see `Choice`; e.g. `take_mode(actor)`.
+        select_action: see `ActionSelector`; e.g. `greedy(actor)`.
         seed: of everything that is drawn; step t depends on (seed, t) and on what was shown.
         samples: K, trajectories of the posterior.
     """
 
-    def __init__(self, model: StateSpaceModel, choose: Choice, seed: int, samples: int = 1) -> None:
-        self.model, self.choose, self.seed, self.samples = model, choose, seed, samples
+    def __init__(self, model: StateSpaceModel, select_action: ActionSelector, seed: int, samples: int = 1) -> None:
+        self.model, self.select_action, self.seed, self.samples = model, select_action, seed, samples
         self.belief, self.steps = model.initial(samples), 0
         self.action = self.belief.state.new_zeros(1, model.action_dim)
 
@@ -50,39 +50,39 @@ class Agent:
             embedding = self.model.embed(shown).expand(self.samples, -1, -1)  # (K, 1, E)
             taken = self.action[:, None].expand(self.samples, -1, -1)  # (K, 1, A)
             filtered = self.model.filter(embedding, taken, self.belief)
-            self.action = self.choose(filtered)
+            self.action = self.select_action(filtered)
         self.belief, self.steps = filtered.at(0), self.steps + 1
         action: NDArray[np.float32] = self.action[0].float().cpu().numpy()
         return action
 
 
-def take_mode(actor: Actor) -> Choice:
+def greedy(actor: Actor) -> ActionSelector:
     r"""Take the most probable action, as for an evaluation; of K trajectories, what they agree on.
 
     .. math:: a = \tfrac1K \sum_k \mathrm{mode}\,\pi(\cdot \mid f^k), \qquad
               \text{of discrete actions the one that most trajectories choose}
     """
 
-    def choose(filtered: Filtered) -> Tensor:
+    def select_action(filtered: Filtered) -> Tensor:
         policy: Policy = actor(filtered.features[:, 0])
         return _agreed(policy.mode(), actor.discrete)
 
-    return choose
+    return select_action
 
 
-def explore(actor: Actor, amount: float) -> Choice:
-    """Draw from the policy, and stray from it: how Dreamer collects. Of K trajectories, what their draws agree on.
+def explore(actor: Actor, amount: float) -> ActionSelector:
+    """Sample from the policy and add exploration noise, as Dreamer does to collect data; average over K trajectories.
 
     Args:
-        actor: chooses.
-        amount: standard deviation of the noise, or, where actions are discrete, how often one is replaced by any.
+        actor: the policy.
+        amount: standard deviation of the noise; of discrete actions the probability of a uniformly random one.
     """
 
-    def choose(filtered: Filtered) -> Tensor:
+    def select_action(filtered: Filtered) -> Tensor:
         policy: Policy = actor(filtered.features[:, 0])
         return _agreed(policy.rsample()[0], actor.discrete)
 
-    return _sometimes_any(choose, amount) if actor.discrete else noisy(choose, amount)
+    return _epsilon_greedy(select_action, amount) if actor.discrete else noisy(select_action, amount)
 
 
 def _agreed(action: Tensor, discrete: bool) -> Tensor:
@@ -91,38 +91,38 @@ def _agreed(action: Tensor, discrete: bool) -> Tensor:
     return one_hot_of(mean.argmax(-1, keepdim=True), mean) if discrete else mean
 
 
-def noisy(choose: Choice, noise: float) -> Choice:
+def noisy(select_action: ActionSelector, noise: float) -> ActionSelector:
     """Add N(0, noise²) to a choice, and clip to [-1, 1]."""
 
     def choose_nearby(filtered: Filtered) -> Tensor:
-        action = choose(filtered)
+        action = select_action(filtered)
         return (action + noise * torch.randn_like(action)).clamp(-1, 1)
 
     return choose_nearby
 
 
-def _sometimes_any(choose: Choice, chance: float) -> Choice:
+def _epsilon_greedy(select_action: ActionSelector, chance: float) -> ActionSelector:
     """Replace a discrete choice by one of all alike, with a probability (ε-greedy)."""
 
     def choose_or_draw(filtered: Filtered) -> Tensor:
-        action = choose(filtered)  # (1, A)
+        action = select_action(filtered)  # (1, A)
         drawn = one_hot_of(torch.randint(action.shape[-1], (1, 1), device=action.device), action)
         return torch.where(torch.rand(1, 1, device=action.device) < chance, drawn, action)
 
     return choose_or_draw
 
 
-def follow_plan(model: StateSpaceModel, reward: Callable[[Tensor], Tensor], search: CrossEntropy) -> Choice:
-    """Search anew at each step, every candidate on a sample of the belief of its own (PlaNet).
+def follow_plan(model: StateSpaceModel, reward: Callable[[Tensor], Tensor], search: CrossEntropy) -> ActionSelector:
+    """Search again at each step, every candidate on a sample of the belief of its own (PlaNet).
 
     Of K trajectories, the candidates take turns.
     """
 
-    def choose(filtered: Filtered) -> Tensor:
+    def select_action(filtered: Filtered) -> Tensor:
         turns = -(-search.candidates // len(filtered.hidden))  # J / K, rounded up
         state, _ = model.posterior.rsample(filtered.context[:, 0], (turns,))  # (J / K, K, D)
         hidden = filtered.hidden[:, 0].expand(turns, -1, -1)  # (J / K, K, H)
         start = State(*(values.flatten(0, 1)[: search.candidates] for values in (hidden, state)))  # (J, H), (J, D)
         return plan(model, reward, start, model.action_dim, search)
 
-    return choose
+    return select_action

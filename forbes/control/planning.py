@@ -55,8 +55,8 @@ def plan(
     Args:
         model: imagines.
         reward: mean reward of features, `(*, F)` to `(*)`.
-        start: J samples of the belief in each of B situations, `(J B, …)` as `StateSpaceModel.beliefs` gives them; each
-            candidate is tried on one, so that what is chosen is good under the belief and not for one sample.
+        start: J samples of the belief in each of B situations, `(J B, …)`, from `StateSpaceModel.sample_beliefs`;
+            each candidate is tried on one, so that what is chosen is good under the belief and not for one sample.
         action_dim: A.
         search: how to search.
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.categorical import draw_one_hot, one_hot_of
-from forbes.models.networks import Perceptron
+from forbes.models.networks import MLP
 from forbes.performance.fusion import fused
 
 __all__ = ["Actor", "OneHotCategorical", "Policy", "ScalarHead", "TanhNormal"]
@@ -118,7 +118,7 @@ class Actor(nn.Module):
     ) -> None:
         super().__init__()
         self.discrete, self.min_std = discrete, min_std
-        self.hidden = Perceptron(feature_dim, width, layers)
+        self.hidden = MLP(feature_dim, width, layers)
         self.head = nn.Linear(width, action_dim if discrete else 2 * action_dim)
 
     def forward(self, features: Tensor) -> Policy:
@@ -140,7 +140,7 @@ class ScalarHead(nn.Module):
 
     def __init__(self, feature_dim: int, width: int, layers: int) -> None:
         super().__init__()
-        self.net = nn.Sequential(Perceptron(feature_dim, width, layers), nn.Linear(width, 1))
+        self.net = nn.Sequential(MLP(feature_dim, width, layers), nn.Linear(width, 1))
 
     def forward(self, features: Tensor) -> Tensor:
         """Return the number, `(*, F)` to `(*)`."""

@@ -32,7 +32,7 @@ from forbes.evaluation.estimates import Estimate
 from forbes.models import Filtered
 from forbes.pomdps import Process
 from forbes.seeding import derive_seed, generator
-from forbes.training.acting import ActingModel
+from forbes.training.acting import WorldModelAgent
 
 __all__ = ["DRAWS", "exact_variance", "filter_episode", "learned_variance", "non_gaussianity", "prior_and_posterior"]
 __all__ += ["uncertainty"]
@@ -45,7 +45,9 @@ _STEPS = 64
 
 
 @contextmanager
-def filter_episode(agent: ActingModel, episode: Episode, samples: int, seed: int) -> Iterator[tuple[Filtered, Tensor]]:
+def filter_episode(
+    agent: WorldModelAgent, episode: Episode, samples: int, seed: int
+) -> Iterator[tuple[Filtered, Tensor]]:
     """Filter an episode. Samples drawn inside of the `with` follow from the seed too; those outside do not change.
 
     Args:
@@ -92,7 +94,7 @@ def non_gaussianity(head: BeliefHead, context: Tensor) -> Tensor:
     return kl
 
 
-def prior_and_posterior(agent: ActingModel, episode: Episode, seed: int) -> Tensor | None:
+def prior_and_posterior(agent: WorldModelAgent, episode: Episode, seed: int) -> Tensor | None:
     """Average it over the steps of an episode, for prior and posterior, float64 `(2,)`; None where s is not continuous.
 
     Args:
@@ -135,7 +137,7 @@ def exact_variance(process: Process, episode: Episode, seed: int) -> Tensor:
     return (weight * (reward - mean).square()).sum(0)
 
 
-def learned_variance(agent: ActingModel, episode: Episode, seed: int) -> Tensor:
+def learned_variance(agent: WorldModelAgent, episode: Episode, seed: int) -> Tensor:
     """Return the variance of each reward over trajectories of an agent's belief, in squared units of reward, `(T,)`."""
     with filter_episode(agent, episode, DRAWS, seed) as (filtered, _):
         reward: Tensor = agent.reward(filtered.features)[:, 1:]  # (S, T)

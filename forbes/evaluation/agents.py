@@ -18,11 +18,11 @@ from forbes.errors import ForbesError
 from forbes.evaluation.agent_beliefs import exact_variance, learned_variance, prior_and_posterior, uncertainty
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.record import require_readable, write_record
-from forbes.evaluation.reward_prediction import SAMPLES, STEPS_AHEAD, explained, foretell
+from forbes.evaluation.reward_prediction import SAMPLES, STEPS_AHEAD, explained, predict_rewards
 from forbes.pomdps import Process
 from forbes.runs.provenance import commit
 from forbes.seeding import derive_seed
-from forbes.training.acting import ActingModel, play_measured
+from forbes.training.acting import WorldModelAgent, play_measured
 from forbes.training.loading import load_run, loaded_agent
 
 __all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", "play_test_episode"]
@@ -37,7 +37,7 @@ class PlayedAgent(NamedTuple):
     """A run and the episodes it was measured in."""
 
     run: str
-    agent: ActingModel
+    agent: WorldModelAgent
     returns: Tensor
     """Undiscounted, `(E,)`, float64."""
     explained: list[Estimate | None]
@@ -55,7 +55,7 @@ def is_agent(run: str) -> bool:
     module, data = load_run(run)
     if isinstance(data.source, Experience):
         data.source.close()
-    return isinstance(module, ActingModel)
+    return isinstance(module, WorldModelAgent)
 
 
 def evaluate_agents(
@@ -91,7 +91,7 @@ def evaluate_agents(
 
 
 def _play(
-    run: str, agent: ActingModel, environment: EnvironmentProcess, checkpoint: str, episodes: int, seed: int
+    run: str, agent: WorldModelAgent, environment: EnvironmentProcess, checkpoint: str, episodes: int, seed: int
 ) -> PlayedAgent:
     returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
     process, variances, distances = _known_process(environment), list[tuple[Tensor, Tensor]](), list[Tensor]()
@@ -100,7 +100,7 @@ def _play(
         returns.append(episode.total_reward)
         rewards.append(torch.from_numpy(episode.reward[1:]).double())  # (T,)
         draws = derive_seed(seed, "foresight", number)
-        foretold.append(foretell(agent, episode, draws, f"{run}, test episode {number}"))
+        foretold.append(predict_rewards(agent, episode, draws, f"{run}, test episode {number}"))
         if (distance := prior_and_posterior(agent, episode, draws)) is not None:
             distances.append(distance)
         if process is not None:
@@ -150,7 +150,7 @@ def _record(one: PlayedAgent, folder: Path, seed: int, command: str) -> None:
     write_record(folder, {name: entry | measured} | shares, {name: one.returns})
 
 
-def play_test_episode(agent: ActingModel, environment: Environment, seed: int, number: int) -> Episode:
+def play_test_episode(agent: WorldModelAgent, environment: Environment, seed: int, number: int) -> Episode:
     """Play an episode of a test, which was not in the training: for every agent, the same seed is the same episode."""
     return play_measured(agent, environment, "test episode", seed, number)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import TrainedRun
 
-__all__ = ["SCORES", "Measured", "Pair", "at_horizons", "degradation", "note", "pair", "score_of"]
+__all__ = ["SCORES", "EvaluatedRun", "Pair", "at_horizons", "degradation", "note", "pair", "score_of"]
 
 _ALL_PAIRS = 4  # runs up to which every two are compared; of more, each with the first
 SCORES = ("elbo", "iwae", "pll", "fivo", "open_loop")
@@ -26,7 +26,7 @@ Curves = Mapping[str, Mapping[str, Sequence[float]]]
 """By metric, then by model, the mean of each step, `(T,)`."""
 
 
-class Measured(NamedTuple):
+class EvaluatedRun(NamedTuple):
     """One run, measured."""
 
     run: TrainedRun
@@ -39,8 +39,8 @@ class Measured(NamedTuple):
 class Pair(NamedTuple):
     """Two runs and the mean difference first - second of each score that both have, over the same sequences."""
 
-    first: Measured
-    second: Measured
+    first: EvaluatedRun
+    second: EvaluatedRun
     differences: dict[str, Estimate]
 
 
@@ -49,7 +49,7 @@ def score_of(metric: str) -> str:
     return metric.partition("/")[2].partition("[")[0]
 
 
-def pair(measured: Sequence[Measured]) -> list[Pair]:
+def pair(measured: Sequence[EvaluatedRun]) -> list[Pair]:
     """Compare every two runs, or where there are many each with the first."""
     pairs = list(itertools.combinations(measured, 2))
     if len(measured) > _ALL_PAIRS:
@@ -68,7 +68,7 @@ def pair(measured: Sequence[Measured]) -> list[Pair]:
     ]
 
 
-def note(first: Measured, second: Measured, differences: dict[str, Estimate]) -> None:
+def note(first: EvaluatedRun, second: EvaluatedRun, differences: dict[str, Estimate]) -> None:
     """Note the differences of a pair in the entries of both."""
     for name, difference in differences.items():
         for one, other, sign in [(first, second, 1), (second, first, -1)]:

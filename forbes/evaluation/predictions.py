@@ -47,7 +47,7 @@ def filter(model: BeliefModel, batch: SequenceBatch, samples: int = 1) -> State:
         >>> belief.hidden.shape, belief.state.shape
         (torch.Size([80, 200]), torch.Size([80, 8]))
     """
-    return model.beliefs(model.see(batch.observation, batch.action), samples)
+    return model.sample_beliefs(model.encode(batch.observation, batch.action), samples)
 
 
 @torch.no_grad()
@@ -110,7 +110,9 @@ def complete(
         torch.Size([10, 8, 15, 1, 28, 28])
     """
     sequences = len(batch.observation)
-    start = model.beliefs(model.see(batch.observation[:, :context], batch.action[:, :context]), samples)  # (N B, ...)
+    start = model.sample_beliefs(
+        model.encode(batch.observation[:, :context], batch.action[:, :context]), samples
+    )  # (N B, ...)
     action = batch.action[:, context:].repeat(samples, 1, 1)  # (N B, T - context, A)
     output = model.decode(model.imagine(start, action).features)  # (N B, T - context, C, H, W)
     draw = source.increments and not mean

@@ -10,9 +10,9 @@ from forbes.errors import ForbesError
 from forbes.evaluation.agent_beliefs import filter_episode
 from forbes.evaluation.estimates import Estimate
 from forbes.models import State
-from forbes.training.acting import ActingModel
+from forbes.training.acting import WorldModelAgent
 
-__all__ = ["SAMPLES", "STEPS_AHEAD", "explained", "foretell", "share_explained"]
+__all__ = ["SAMPLES", "STEPS_AHEAD", "explained", "predict_rewards", "r2_score"]
 
 STEPS_AHEAD = (0, 1, 5, 15)
 """k; 0 is the reward that comes with the observation the belief has just seen, 15 the horizon of imagination."""
@@ -20,8 +20,8 @@ SAMPLES = 16
 """S, trajectories of the belief."""
 
 
-def foretell(
-    agent: ActingModel, episode: Episode, seed: int, name: str, ahead: Sequence[int] = STEPS_AHEAD
+def predict_rewards(
+    agent: WorldModelAgent, episode: Episode, seed: int, name: str, ahead: Sequence[int] = STEPS_AHEAD
 ) -> list[Tensor]:
     r"""Foretell every reward of an episode from the belief of k steps before, by the actions that were taken.
 
@@ -68,7 +68,7 @@ def explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor]) -
     1 is perfect, 0 as good as always foretelling the mean; the error is that of a ratio, over episodes.
 
     Args:
-        foretold: by `foretell`, of E episodes, at least 2.
+        foretold: by `predict_rewards`, of E episodes, at least 2.
         rewards: r_2 to r_{T+1} of each, `(T,)`, float64.
 
     Returns:
@@ -77,7 +77,7 @@ def explained(foretold: Sequence[Sequence[Tensor]], rewards: Sequence[Tensor]) -
     return [_estimate(*_squares(told, rewards)) for told in zip(*foretold, strict=True)]
 
 
-def share_explained(foretold: Sequence[Tensor], rewards: Sequence[Tensor]) -> float | None:
+def r2_score(foretold: Sequence[Tensor], rewards: Sequence[Tensor]) -> float | None:
     """Return the share of one distance as `explained` does; without an error, so that one episode will do."""
     missed, there = _squares(foretold, rewards)
     return 1 - (missed.sum() / there.sum()).item() if there.sum() > 0 else None

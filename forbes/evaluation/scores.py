@@ -103,14 +103,16 @@ def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, pred
         number: of trajectories.
         predict: whether to draw the one-step predictions too.
     """
-    seen = model.see(batch.observation, batch.action)  # once: coarse pixels have noise, the same for both networks
-    target = seen.target.flatten(0, 1)  # (B T, *O)
+    encoded = model.encode(
+        batch.observation, batch.action
+    )  # once: coarse pixels have noise, the same for both networks
+    target = encoded.target.flatten(0, 1)  # (B T, *O)
 
     def log_prob(features: Tensor) -> Tensor:
         return frame_log_prob(model, features.flatten(0, 1), target).view(batch.mask.shape)  # (B, T)
 
     for _ in range(number):
-        filtered = model.filter(seen.embedding, seen.action)
+        filtered = model.filter(encoded.embedding, encoded.action)
         kl = filtered.log_prob - model.prior_log_prob(filtered)
         prediction = log_prob(model.predict(filtered)) if predict else None
         yield Trajectory(log_prob(filtered.features), kl.double(), prediction)
@@ -147,10 +149,10 @@ def score_predictions(model: BeliefModel, batch: SequenceBatch, number: int) -> 
     """Score a batch with K particles: `pll`, and `iwae` where the model has a posterior."""
     if isinstance(model, StateSpaceModel) and model.particles == 1:
         return score_trajectories(model, batch, number, predict=True)  # its trajectories serve both
-    seen, prediction = model.see(batch.observation, batch.action), LogMeanExp()
-    for _ in range(model.draws(number)):
-        features, log_weight = model.predictions(seen)
-        log_prob = frame_log_prob(model, features.flatten(1, 2), seen.target.flatten(0, 1))  # (K, B T)
+    encoded, prediction = model.encode(batch.observation, batch.action), LogMeanExp()
+    for _ in range(model.num_belief_samples(number)):
+        features, log_weight = model.predict_one_step(encoded)
+        log_prob = frame_log_prob(model, features.flatten(1, 2), encoded.target.flatten(0, 1))  # (K, B T)
         prediction.add((log_prob.view(log_weight.shape) + log_weight).logsumexp(0))  # (B, T)
     scores = {"pll": prediction.result() * batch.mask}
     if isinstance(model, StateSpaceModel):
@@ -167,9 +169,9 @@ def score_particles(model: StateSpaceModel, batch: SequenceBatch, number: int) -
         batch: B sequences; K B rows are held at once.
         number: K.
     """
-    seen, fivo, ess = model.see(batch.observation, batch.action), [], []
+    encoded, fivo, ess = model.encode(batch.observation, batch.action), [], []
     log_likelihood = partial(frame_log_prob, model)
-    for step in run_particles(model, seen, number, systematic, log_likelihood, dtype=torch.float64):
+    for step in run_particles(model, encoded, number, systematic, log_likelihood, dtype=torch.float64):
         fivo.append(step.increment)  # (B,)
         ess.append(effective_sample_size(step.log_weight) / number)
     scores = {"fivo": torch.stack(fivo, 1), "ess": torch.stack(ess, 1)}  # (B, T)
@@ -192,12 +194,12 @@ def score_open_loop(model: BeliefModel, batch: SequenceBatch, number: int, conte
         context: c, steps that the model sees, from 1 to T - 1.
     """
     mask = batch.mask[:, context:].double()  # (B, T - c)
-    seen = model.see(batch.observation[:, :context], batch.action[:, :context])
+    encoded = model.encode(batch.observation[:, :context], batch.action[:, :context])
     target = model.likelihood.target(batch.observation[:, context:]).flatten(0, 1)  # (B (T - c), *O)
     future = batch.action[:, context:].repeat(model.particles, 1, 1)  # (N B, T - c, A)
     joint, marginal = LogMeanExp(), LogMeanExp()
-    for _ in range(model.draws(number)):
-        features = model.imagine(model.beliefs(seen, model.particles), future).features  # (N B, T - c, F)
+    for _ in range(model.num_belief_samples(number)):
+        features = model.imagine(model.sample_beliefs(encoded, model.particles), future).features  # (N B, T - c, F)
         of_each = features.view(model.particles, len(target), -1)  # (N, B (T - c), F)
         for log_prob in frame_log_prob(model, of_each, target).view(-1, *mask.shape):  # N times (B, T - c)
             joint.add((log_prob * mask).cumsum(1))

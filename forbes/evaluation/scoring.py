@@ -30,19 +30,19 @@ from forbes.reading import read_npz
 from forbes.seeding import derive_seed
 
 __all__ = [
-    "Parts",
-    "Pass",
+    "PartialScores",
+    "Scorer",
     "Scores",
     "evaluate",
-    "exact_pass",
-    "make_pass",
+    "exact_scorer",
+    "make_scorer",
     "require_finite",
     "score_split",
     "with_progress",
 ]
 
 
-class Pass(NamedTuple):
+class Scorer(NamedTuple):
     """One way through the data, which gives one score or several."""
 
     metrics: tuple[str, ...]
@@ -56,7 +56,7 @@ class Pass(NamedTuple):
     context: int = 0
     """Steps at the beginning that are seen and not scored."""
 
-    def of(self, model: BeliefModel) -> "Pass":
+    def of(self, model: BeliefModel) -> "Scorer":
         """Leave the bounds out for a model without a posterior: its likelihood is exact, and `pll` gives it."""
         bounds = () if isinstance(model, StateSpaceModel) else _BOUNDS
         return self._replace(metrics=tuple(metric for metric in self.metrics if metric not in bounds))
@@ -86,7 +86,7 @@ _FIVO_ROWS = 16
 """FIVO holds all particles of a sequence at once: so many rows for each sequence of another pass's batch."""
 
 
-def make_pass(name: str, number: int, batch_size: int, context: int) -> Pass:
+def make_scorer(name: str, number: int, batch_size: int, context: int) -> Scorer:
     """Build one of the passes that `forbes evaluate --scores` names.
 
     Args:
@@ -98,14 +98,14 @@ def make_pass(name: str, number: int, batch_size: int, context: int) -> Pass:
     """
     if name == "elbo":
         function = partial(score_trajectories, number=number, predict=False)
-        return Pass(("elbo", "reconstruction", "kl"), f"S={number}", function, batch_size)
+        return Scorer(("elbo", "reconstruction", "kl"), f"S={number}", function, batch_size)
     if name == "pll":
-        return Pass(("iwae", "pll"), f"K={number}", partial(score_predictions, number=number), batch_size)
+        return Scorer(("iwae", "pll"), f"K={number}", partial(score_predictions, number=number), batch_size)
     if name == "fivo":
         rows = max(1, _FIVO_ROWS * batch_size // number)
-        return Pass(("fivo", "ess"), f"K={number}", partial(score_particles, number=number), rows)
+        return Scorer(("fivo", "ess"), f"K={number}", partial(score_particles, number=number), rows)
     metrics, function = ("open_loop", "open_loop_marginal"), partial(score_open_loop, number=number, context=context)
-    return Pass(metrics, f"K={number},c={context}", function, batch_size, context)
+    return Scorer(metrics, f"K={number},c={context}", function, batch_size, context)
 
 
 def evaluate(
@@ -158,7 +158,7 @@ def evaluate(
     numbers = {"samples": samples, "particles": particles, "futures": futures}
     found: dict[str, Estimate] = {}
     for name in scores:
-        score = make_pass(name, numbers[PASSES[name]], batch_size, context).of(model)
+        score = make_scorer(name, numbers[PASSES[name]], batch_size, context).of(model)
         scored = score_split(model, split_batches(data, split, count, score.batch_size), score, seed)
         found |= {metric: Estimate.of(scored.total(metric)) for metric in score.metrics}
     return found
@@ -167,7 +167,7 @@ def evaluate(
 _EXACT_ROWS = 20  # sequences; a belief on a fine grid is 3 MB each
 
 
-def exact_pass(process: Process) -> Pass:
+def exact_scorer(process: Process) -> Scorer:
     """Build the pass that asks the process itself: `log_p`, the sum of its one-step predictive log-likelihoods.
 
     No bound is above it, and no belief has a higher prequential score in expectation.
@@ -176,10 +176,10 @@ def exact_pass(process: Process) -> Pass:
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         return {"log_p": process.exact_filter(batch.observation, batch.action).step_log_likelihood}
 
-    return Pass(("log_p",), "exact", function, _EXACT_ROWS)
+    return Scorer(("log_p",), "exact", function, _EXACT_ROWS)
 
 
-class Parts:
+class PartialScores:
     """Scores of finished batches, one file each, so that an interrupted evaluation goes on where it stopped.
 
     Args:
@@ -217,10 +217,10 @@ class Parts:
 def score_split(
     model: BeliefModel,
     batches: Iterable[tuple[int, SequenceBatch]],
-    score: Pass,
+    score: Scorer,
     seed: int = 0,
     where: str = "the model",
-    parts: Parts | None = None,
+    parts: PartialScores | None = None,
 ) -> Scores:
     """Score every sequence.
 
@@ -252,7 +252,7 @@ def score_split(
     return Scores(merged, torch.cat([scores.mask for scores in found]))
 
 
-def _score(model: BeliefModel, first: int, batch: SequenceBatch, score: Pass, seed: int, where: str) -> Increments:
+def _score(model: BeliefModel, first: int, batch: SequenceBatch, score: Scorer, seed: int, where: str) -> Increments:
     """Score a batch; where the memory does not suffice, each half of it."""
     torch.manual_seed(derive_seed(seed, "evaluation", first))
     try:

@@ -1,6 +1,6 @@
 """State-space models as pure modules: they compute and return records, and never log."""
 
-from forbes.models.base import BeliefModel, ModelFamily, Prediction, Rollout, Seen, State
+from forbes.models.base import BeliefModel, EncodedSequence, ModelFamily, Prediction, Rollout, State
 from forbes.models.elbo import ElboTerms, elbo_loss
 from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, OnePixel, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
@@ -15,6 +15,7 @@ __all__ = [
     "ConvDecoder",
     "ConvEncoder",
     "ElboTerms",
+    "EncodedSequence",
     "Filtered",
     "Likelihood",
     "MLPDecoder",
@@ -28,7 +29,6 @@ __all__ = [
     "PixelEncoder",
     "Prediction",
     "Rollout",
-    "Seen",
     "State",
     "StateSpaceModel",
     "VectorModel",

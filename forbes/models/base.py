@@ -16,10 +16,10 @@ from forbes.beliefs import BeliefFamily
 from forbes.configured import Configurable
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import Decoder, Encoder, Perceptron
+from forbes.models.networks import MLP, Decoder, Encoder
 from forbes.shapes import printed_by_shape
 
-__all__ = ["BeliefModel", "ModelFamily", "Prediction", "Rollout", "Seen", "State"]
+__all__ = ["BeliefModel", "EncodedSequence", "ModelFamily", "Prediction", "Rollout", "State"]
 
 
 @printed_by_shape
@@ -50,7 +50,7 @@ class Rollout(NamedTuple):
 
 
 @printed_by_shape
-class Seen(NamedTuple):
+class EncodedSequence(NamedTuple):
     """What a filter reads, encoded once for all the times it is read."""
 
     target: Tensor
@@ -106,7 +106,7 @@ class BeliefModel(Configurable, nn.Module, ABC):
         super().__init__()
         self.hidden_dim = hidden_dim
         self.encoder, self.decoder, self.likelihood = encoder, decoder, likelihood
-        self.transition = Perceptron(input_dim, mlp_dim, mlp_layers)
+        self.transition = MLP(input_dim, mlp_dim, mlp_layers)
         self.gru = nn.GRUCell(mlp_dim, hidden_dim)
         self.register_buffer("center", None)
 
@@ -120,7 +120,7 @@ class BeliefModel(Configurable, nn.Module, ABC):
         """Return (h_0, s_0), `(B, ...)`: what is carried before anything was seen."""
 
     @abstractmethod
-    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Estimate the lower bound of log p(o_1:T) that the model is trained by.
 
         Args:
@@ -131,11 +131,11 @@ class BeliefModel(Configurable, nn.Module, ABC):
         """
 
     @abstractmethod
-    def beliefs(self, seen: Seen, samples: int) -> State:
+    def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
         """Draw N of the belief over (h, s) after the last step, given all that was seen: `(N B, ...)`, sample-major."""
 
     @abstractmethod
-    def predictions(self, seen: Seen) -> Prediction:
+    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
         """Predict every o_t from one draw of the belief after t - 1 steps, of `particles` particles."""
 
     @abstractmethod
@@ -150,20 +150,20 @@ class BeliefModel(Configurable, nn.Module, ABC):
             T steps after `start`, which itself is not among them.
         """
 
-    def draws(self, number: int) -> int:
+    def num_belief_samples(self, number: int) -> int:
         """Return how many independent draws of the belief make so many particles."""
         return number
 
-    def see(self, observation: Tensor, action: Tensor) -> Seen:
+    def encode(self, observation: Tensor, action: Tensor) -> EncodedSequence:
         """Read stored observations `(B, T, *O)` and the actions that led to them `(B, T, A)`."""
         target = self.likelihood.target(observation)
-        return Seen(target, self.encode(target), action)
+        return EncodedSequence(target, self.embed_target(target), action)
 
     def embed(self, observation: Tensor) -> Tensor:
         """Encode every frame: stored observations `(B, T, *O)` to e `(B, T, E)`."""
-        return self.encode(self.likelihood.target(observation))
+        return self.embed_target(self.likelihood.target(observation))
 
-    def encode(self, target: Tensor) -> Tensor:
+    def embed_target(self, target: Tensor) -> Tensor:
         """Encode every frame as `Likelihood.target` or `Likelihood.sample` gives it: `(B, T, *O)` to e `(B, T, E)`."""
         shown = target if self.center is None else target - self.center
         embedding: Tensor = self.encoder(shown.flatten(0, 1)).to(target.dtype)  # (B T, E)

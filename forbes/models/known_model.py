@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from forbes.beliefs import BeliefFamily, BeliefHead
 from forbes.models.elbo import ElboTerms
-from forbes.models.networks import Perceptron
+from forbes.models.networks import MLP
 
-__all__ = ["Densities", "KnownModel", "LearnedBelief", "Units"]
+__all__ = ["Densities", "KnownModel", "LearnedBelief", "Standardizer"]
 
 
 class Densities(Protocol):
@@ -31,7 +31,7 @@ class Densities(Protocol):
         """Return log p(o_t | s_t): `(*, O)` and `(*, D)`, which broadcast, to `(*)`."""
 
 
-class Units(nn.Module):
+class Standardizer(nn.Module):
     r"""Units in which a vector has mean 0 and variance 1: :math:`z = (x - \mu) / \sigma`, fixed, from examples.
 
     Networks and the smallest standard deviations of belief families presume a scale of about 1; some processes have 10.
@@ -71,7 +71,7 @@ class LearnedBelief:
         units: :math:`\mu` and :math:`\sigma`.
     """
 
-    def __init__(self, head: BeliefHead, context: Tensor, units: Units) -> None:
+    def __init__(self, head: BeliefHead, context: Tensor, units: Standardizer) -> None:
         self.head, self.context, self.units = head, context, units
 
     def rsample(self, count: int) -> tuple[Tensor, Tensor]:
@@ -108,8 +108,8 @@ class KnownModel(nn.Module):
         self,
         process: Densities,
         belief: BeliefFamily,
-        of_state: Units,
-        of_input: Units,
+        of_state: Standardizer,
+        of_input: Standardizer,
         hidden_dim: int,
         mlp_dim: int,
         mlp_layers: int,
@@ -117,7 +117,7 @@ class KnownModel(nn.Module):
         super().__init__()
         self.process, self.of_state, self.of_input = process, of_state, of_input
         self.gru = nn.GRU(len(of_input.mean), hidden_dim, batch_first=True)
-        self.context = Perceptron(hidden_dim, mlp_dim, mlp_layers)
+        self.context = MLP(hidden_dim, mlp_dim, mlp_layers)
         self.head: BeliefHead = belief(len(of_state.mean), mlp_dim)
 
     def belief(self, observation: Tensor, action: Tensor) -> LearnedBelief:

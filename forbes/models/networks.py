@@ -12,16 +12,16 @@ from torch.nn.functional import elu, relu
 from forbes.configured import Configurable
 from forbes.errors import ForbesError
 from forbes.performance.fusion import Elementwise, fused
-from forbes.performance.time_loop import Loop
+from forbes.performance.time_loop import TimeLoop
 
 __all__ = [
+    "MLP",
     "ConvDecoder",
     "ConvEncoder",
     "Decoder",
     "Encoder",
     "MLPDecoder",
     "MLPEncoder",
-    "Perceptron",
     "activate",
     "bind_gru",
     "transposed_kernels",
@@ -34,7 +34,7 @@ _KERNEL = 4
 """Of the encoder's convolutions, pixels a side."""
 
 
-class Perceptron(nn.Sequential):
+class MLP(nn.Sequential):
     """`layers` linear layers of `width`, each followed by the activation: a ReLU, until `activate` says otherwise."""
 
     def __init__(self, input_dim: int, width: int, layers: int) -> None:
@@ -55,12 +55,12 @@ class Perceptron(nn.Sequential):
 def activate(module: nn.Module, activation: Activation) -> None:
     """Replace the activation of every perceptron of a module."""
     for part in module.modules():
-        if isinstance(part, Perceptron):
+        if isinstance(part, MLP):
             for block in part.children():
                 block.add_module("1", _ACTIVATIONS[activation]())
 
 
-def bind_gru(cell: nn.GRUCell, loop: Loop) -> Callable[[Tensor, Tensor], Tensor]:
+def bind_gru(cell: nn.GRUCell, loop: TimeLoop) -> Callable[[Tensor, Tensor], Tensor]:
     r"""Bind a GRU cell to a loop: (x, h) to the next h, `(B, H)`; the same numbers as `cell(x, h)`.
 
     .. math:: r, z = \sigma(W_{ir} x + W_{hr} h), \sigma(W_{iz} x + W_{hz} h), \quad
@@ -118,7 +118,7 @@ class MLPEncoder(Encoder):
     def __init__(self, observation_shape: tuple[int, ...], width: int = 200, layers: int = 2) -> None:
         super().__init__()
         self.embedding_dim = width
-        self.net = Perceptron(math.prod(observation_shape), width, layers)
+        self.net = MLP(math.prod(observation_shape), width, layers)
 
     def forward(self, observation: Tensor) -> Tensor:
         """See `Encoder`."""
@@ -156,7 +156,7 @@ class MLPDecoder(Decoder):
         last = nn.Linear(width, math.prod(observation_shape))
         if output_bias:
             nn.init.constant_(last.bias, output_bias)
-        self.net = nn.Sequential(Perceptron(feature_dim, width, layers), last)
+        self.net = nn.Sequential(MLP(feature_dim, width, layers), last)
 
     def forward(self, features: Tensor) -> Tensor:
         """See `Decoder`."""

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from forbes.beliefs import BeliefFamily
 from forbes.errors import ForbesError
-from forbes.models.base import Prediction, Seen, State
+from forbes.models.base import EncodedSequence, Prediction, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder
@@ -106,7 +106,7 @@ def soft(log_weight: Tensor) -> tuple[Tensor, Tensor]:
 
 def run_particles(
     model: StateSpaceModel,
-    seen: Seen,
+    encoded: EncodedSequence,
     number: int,
     resampling: Resampling,
     log_likelihood: Callable[[Tensor, Tensor], Tensor],
@@ -116,23 +116,23 @@ def run_particles(
 
     Args:
         model: its posterior is the proposal.
-        seen: B sequences of T steps.
+        encoded: B sequences of T steps.
         number: K.
         resampling: `systematic` or `soft`.
         log_likelihood: log p(o_t | features), of features `(K, B, H + D)` and o_t `(B, *O)`, to `(K, B)`.
         dtype: of the weights.
     """
-    sequences, steps = seen.embedding.shape[:2]
-    stay = torch.arange(number, device=seen.embedding.device)[:, None].expand(-1, sequences)  # (K, B)
+    sequences, steps = encoded.embedding.shape[:2]
+    stay = torch.arange(number, device=encoded.embedding.device)[:, None].expand(-1, sequences)  # (K, B)
     log_before = torch.full(stay.shape, -math.log(number), dtype=dtype, device=stay.device)
-    with full_precision(seen.embedding):
-        step = model.bind(seen.embedding, seen.action, number)
+    with full_precision(encoded.embedding):
+        step = model.prepare_step(encoded.embedding, encoded.action, number)
     carried = model.initial(number * sequences)
     for t in range(steps):
-        with full_precision(seen.embedding):
+        with full_precision(encoded.embedding):
             moved = step(carried)
         features = moved.features.view(*stay.shape, -1)  # (K, B, H + D)
-        reconstruction = log_likelihood(features, seen.target[:, t])
+        reconstruction = log_likelihood(features, encoded.target[:, t])
         divergence = (moved.log_prob - model.prior_log_prob(moved)).view(stay.shape)  # (K, B)
         joint = log_before + reconstruction - divergence
         increment = joint.logsumexp(0)  # (B,)
@@ -199,35 +199,35 @@ class ParticleModel(StateSpaceModel):
         """See `BeliefModel.bound_name`."""
         return f"fivo[{self.likelihood.name},K={self.particles}]"
 
-    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
-        r"""See `BeliefModel.elbo`: with K particles.
+    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+        r"""See `BeliefModel.lower_bound`: with K particles.
 
         The reconstruction is the weighted mean :math:`\sum_k W_t^k \log p(o_t \mid h_t^k, s_t^k)`, the KL what it
         exceeds :math:`\log \hat p_t` by.
         """
-        steps = list(self._run(self.see(observation, action)))
+        steps = list(self._run(self.encode(observation, action)))
         increment = torch.stack([step.increment for step in steps], 1)  # (B, T)
         weighted = [(step.log_weight.exp() * step.log_likelihood).sum(0) for step in steps]
         reconstruction = torch.stack(weighted, 1)  # (B, T)
         return ElboTerms(reconstruction, kl=reconstruction - increment, analytic_kl=None, mask=mask)
 
-    def beliefs(self, seen: Seen, samples: int) -> State:
-        """See `BeliefModel.beliefs`: a systematic sample of one weighted set; particles may come up several times."""
-        last = deque(self._run(seen), maxlen=1)[0]
+    def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
+        """See `BeliefModel.sample_beliefs`: a systematic sample of one weighted set, with repetitions."""
+        last = deque(self._run(encoded), maxlen=1)[0]
         uniform = torch.rand_like(last.log_weight[0])  # (B,)
         return _choose(last.hidden, last.state, systematic_resampling(last.log_weight, uniform, samples))
 
-    def predictions(self, seen: Seen) -> Prediction:
-        """See `BeliefModel.predictions`: each particle draws s_t from the prior."""
+    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
+        """See `BeliefModel.predict_one_step`: each particle draws s_t from the prior."""
         features, log_weight = [], []
-        for step in self._run(seen):
+        for step in self._run(encoded):
             state, _ = self.prior.rsample(self.prior_context(step.hidden))  # (K, B, D)
             features.append(torch.cat((step.hidden, state), -1))  # (K, B, H + D)
             log_weight.append(step.log_before.log_softmax(0))
         return Prediction(torch.stack(features, 2), torch.stack(log_weight, 2))  # (K, B, T, H + D), (K, B, T)
 
-    def draws(self, number: int) -> int:
-        """See `BeliefModel.draws`: a draw is a whole set."""
+    def num_belief_samples(self, number: int) -> int:
+        """See `BeliefModel.num_belief_samples`: a draw is a whole set."""
         if number % self.particles:
             raise ForbesError(
                 f"ParticleModel: {number} particles or futures, expected whole sets of {self.particles}, "
@@ -235,7 +235,7 @@ class ParticleModel(StateSpaceModel):
             )
         return number // self.particles
 
-    def _run(self, seen: Seen) -> Iterator[Particles]:
+    def _run(self, encoded: EncodedSequence) -> Iterator[Particles]:
         return run_particles(
-            self, seen, self.particles, self.resampling, self.log_likelihood, dtype=seen.embedding.dtype
+            self, encoded, self.particles, self.resampling, self.log_likelihood, dtype=encoded.embedding.dtype
         )

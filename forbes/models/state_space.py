@@ -18,12 +18,12 @@ from torch.nn.functional import linear
 
 from forbes.beliefs import BeliefFamily, BeliefHead
 from forbes.errors import ForbesError
-from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
+from forbes.models.base import BeliefModel, EncodedSequence, Prediction, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import Decoder, Encoder, Perceptron, bind_gru
+from forbes.models.networks import MLP, Decoder, Encoder, bind_gru
 from forbes.performance.precision import full_precision
-from forbes.performance.time_loop import Affine, Loop
+from forbes.performance.time_loop import Affine, TimeLoop
 from forbes.shapes import printed_by_shape
 
 __all__ = ["Filtered", "StateSpaceModel"]
@@ -93,8 +93,8 @@ class StateSpaceModel(BeliefModel):
             raise ForbesError(f"{type(self).__name__}: state_dim is {state_dim}, expected at least 1")
         super().__init__(encoder, decoder, likelihood, state_dim + action_dim, hidden_dim, mlp_dim, mlp_layers)
         self.action_dim, self.state_dim = action_dim, state_dim
-        self.prior_context = Perceptron(hidden_dim, mlp_dim, mlp_layers)
-        self.posterior_context = Perceptron(hidden_dim + encoder.embedding_dim, mlp_dim, mlp_layers)
+        self.prior_context = MLP(hidden_dim, mlp_dim, mlp_layers)
+        self.posterior_context = MLP(hidden_dim + encoder.embedding_dim, mlp_dim, mlp_layers)
         self.prior: BeliefHead = (prior or belief)(state_dim, mlp_dim)
         self.posterior: BeliefHead = belief(state_dim, mlp_dim)
 
@@ -108,7 +108,7 @@ class StateSpaceModel(BeliefModel):
         weight = self.gru.weight_hh
         return State(weight.new_zeros(batch, self.hidden_dim), weight.new_zeros(batch, self.state_dim))
 
-    def bind(self, embedding: Tensor, action: Tensor, copies: int = 1) -> Callable[[State], Filtered]:
+    def prepare_step(self, embedding: Tensor, action: Tensor, copies: int = 1) -> Callable[[State], Filtered]:
         """Prepare the filter for a loop over a sequence: what does not depend on the recurrence is computed here.
 
         Args:
@@ -120,7 +120,7 @@ class StateSpaceModel(BeliefModel):
             One step, to be called T times: (h, s) before it to those after it, `(N B, ...)`, copy-major.
         """
         batch, time = embedding.shape[:2]
-        loop = Loop(time, copies * batch)
+        loop = TimeLoop(time, copies * batch)
         transition = self._bind(self.transition, action, loop)
         posterior_context = self._bind(self.posterior_context, embedding, loop)
         gru = bind_gru(self.gru, loop)
@@ -149,7 +149,7 @@ class StateSpaceModel(BeliefModel):
         state = start or self.initial(len(embedding))
         steps: list[Filtered] = []
         with full_precision(embedding):
-            step = self.bind(embedding, action)
+            step = self.prepare_step(embedding, action)
             for _ in range(embedding.shape[1]):
                 steps.append(step(state))
                 state = State(steps[-1].hidden, steps[-1].state)
@@ -163,9 +163,9 @@ class StateSpaceModel(BeliefModel):
     def imagine(self, start: State, action: Tensor) -> Rollout:
         """See `BeliefModel.imagine`: rolls the prior on."""
         given = iter(action.unbind(1))
-        return self.roll(start, lambda _: next(given), action.shape[1])
+        return self.rollout(start, lambda _: next(given), action.shape[1])
 
-    def roll(self, start: State, policy: Callable[[Tensor], Tensor], steps: int) -> Rollout:
+    def rollout(self, start: State, policy: Callable[[Tensor], Tensor], steps: int) -> Rollout:
         """Roll the prior on from `start`, each row on its own trajectory and by its own actions.
 
         Args:
@@ -179,7 +179,7 @@ class StateSpaceModel(BeliefModel):
         hidden, state = start
         made: list[tuple[Tensor, Tensor, Tensor]] = []
         with full_precision(state):
-            sample = self.prior.sampler(Loop(steps, len(state)))
+            sample = self.prior.sampler(TimeLoop(steps, len(state)))
             for _ in range(steps):
                 action = policy(torch.cat((hidden, state), -1))
                 hidden = self.gru(self.transition(torch.cat((state, action), -1)), hidden)
@@ -187,28 +187,30 @@ class StateSpaceModel(BeliefModel):
                 made.append((hidden, state, log_prob))
         return Rollout(*(torch.stack(values, 1) for values in zip(*made, strict=True)))  # (B, T, ...)
 
-    def beliefs(self, seen: Seen, samples: int) -> State:
-        """See `BeliefModel.beliefs`: each from a posterior trajectory of its own, since the belief is over (h, s)."""
-        return self.filter(seen.embedding.repeat(samples, 1, 1), seen.action.repeat(samples, 1, 1)).at(-1)  # (N B, ...)
+    def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
+        """See `BeliefModel.sample_beliefs`: each from its own posterior trajectory, for h is random too."""
+        return self.filter(encoded.embedding.repeat(samples, 1, 1), encoded.action.repeat(samples, 1, 1)).at(
+            -1
+        )  # (N B, ...)
 
     def predict(self, filtered: Filtered) -> Tensor:
         """Return [h_t, s_t] with s_t drawn from the prior, which has not seen o_t, `(B, T, H + D)`."""
         state, _ = self.prior.rsample(self.prior_context(filtered.hidden))  # (B, T, D)
         return torch.cat((filtered.hidden, state), -1)  # (B, T, H + D)
 
-    def predictions(self, seen: Seen) -> Prediction:
-        """See `BeliefModel.predictions`: along one posterior trajectory."""
-        features = self.predict(self.filter(seen.embedding, seen.action))
+    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
+        """See `BeliefModel.predict_one_step`: along one posterior trajectory."""
+        features = self.predict(self.filter(encoded.embedding, encoded.action))
         return Prediction(features[None], features.new_zeros(1, *features.shape[:2]))  # (1, B, T, H + D), (1, B, T)
 
-    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
-        """See `BeliefModel.elbo`: with one posterior trajectory per sequence."""
-        seen = self.see(observation, action)
-        return self.bound(self.filter(seen.embedding, action), seen, mask, kl)
+    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+        """See `BeliefModel.lower_bound`: with one posterior trajectory per sequence."""
+        encoded = self.encode(observation, action)
+        return self.bound(self.filter(encoded.embedding, action), encoded, mask, kl)
 
-    def bound(self, filtered: Filtered, seen: Seen, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+    def bound(self, filtered: Filtered, encoded: EncodedSequence, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Estimate the bound with the posterior trajectory that `filter` has drawn for what was seen."""
-        reconstruction = self.log_likelihood(filtered.features, seen.target)
+        reconstruction = self.log_likelihood(filtered.features, encoded.target)
         with full_precision(filtered.state):
             prior_context = self.prior_context(filtered.hidden)  # (B, T, C)
             analytic = self.posterior.kl(filtered.context, self.prior, prior_context) if kl == "analytic" else None
@@ -219,7 +221,7 @@ class StateSpaceModel(BeliefModel):
         return ElboTerms(reconstruction, sampled, analytic, mask)
 
     @staticmethod
-    def _bind(network: Perceptron, known: Tensor, loop: Loop) -> Affine:
+    def _bind(network: MLP, known: Tensor, loop: TimeLoop) -> Affine:
         """Bind a perceptron of [x, known] to a loop over x; the share of what is known is one matmul over all steps.
 
         Args:

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 
 from forbes.beliefs import BeliefFamily
 from forbes.errors import ForbesError
-from forbes.models.base import BeliefModel, Prediction, Rollout, Seen, State
+from forbes.models.base import BeliefModel, EncodedSequence, Prediction, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import Decoder, Encoder, bind_gru
 from forbes.performance.precision import full_precision
-from forbes.performance.time_loop import Loop
+from forbes.performance.time_loop import TimeLoop
 
 __all__ = ["VectorModel"]
 
@@ -110,26 +110,26 @@ class VectorModel(BeliefModel):
         rolled = self._run(hidden, torch.cat((before[:, None], nothing), 1), action)
         return Rollout(rolled, rolled[..., :0], rolled.new_zeros(rolled.shape[:2]))
 
-    def beliefs(self, seen: Seen, samples: int) -> State:
-        """See `BeliefModel.beliefs`: N times the same, since it is certain."""
-        hidden = self.filter(seen.embedding, seen.action)
-        return State(hidden[:, -1].repeat(samples, 1), seen.embedding[:, -1].repeat(samples, 1))  # (N B, ...)
+    def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
+        """See `BeliefModel.sample_beliefs`: N times the same, since it is certain."""
+        hidden = self.filter(encoded.embedding, encoded.action)
+        return State(hidden[:, -1].repeat(samples, 1), encoded.embedding[:, -1].repeat(samples, 1))  # (N B, ...)
 
-    def predictions(self, seen: Seen) -> Prediction:
-        """See `BeliefModel.predictions`."""
-        hidden = self.filter(seen.embedding, seen.action)
+    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
+        """See `BeliefModel.predict_one_step`."""
+        hidden = self.filter(encoded.embedding, encoded.action)
         return Prediction(hidden[None], hidden.new_zeros(1, *hidden.shape[:2]))  # (1, B, T, H), (1, B, T)
 
-    def draws(self, number: int) -> int:
-        """See `BeliefModel.draws`: one is as good as many."""
+    def num_belief_samples(self, number: int) -> int:
+        """See `BeliefModel.num_belief_samples`: one is as good as many."""
         return 1
 
-    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Return log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the roll-out beside them."""
-        seen = self.see(observation, action)
-        hidden = self.filter(seen.embedding, action)
-        log_likelihood = self.log_likelihood(hidden, seen.target)  # (B, T)
-        auxiliary = {"overshoot": self._overshoot(hidden, seen, mask)}
+        encoded = self.encode(observation, action)
+        hidden = self.filter(encoded.embedding, action)
+        log_likelihood = self.log_likelihood(hidden, encoded.target)  # (B, T)
+        auxiliary = {"overshoot": self._overshoot(hidden, encoded, mask)}
         return ElboTerms(log_likelihood, torch.zeros_like(log_likelihood), None, mask, auxiliary)
 
     def _run(self, hidden: Tensor, embedding: Tensor, action: Tensor) -> Tensor:
@@ -137,13 +137,13 @@ class VectorModel(BeliefModel):
         steps: list[Tensor] = []
         with full_precision(embedding):
             moves = self.transition(torch.cat((embedding, action), -1))  # (B, T, M)
-            gru = bind_gru(self.gru, Loop(moves.shape[1], len(moves)))
+            gru = bind_gru(self.gru, TimeLoop(moves.shape[1], len(moves)))
             for move in moves.unbind(1):
                 hidden = gru(move, hidden)
                 steps.append(hidden)
         return torch.stack(steps, 1)  # (B, T, H)
 
-    def _overshoot(self, hidden: Tensor, seen: Seen, mask: Tensor) -> Tensor:
+    def _overshoot(self, hidden: Tensor, encoded: EncodedSequence, mask: Tensor) -> Tensor:
         r"""Return the loss of one roll-out in each sequence, from a step u among its own, in nats per step.
 
         .. math:: -\frac1L \sum_{j=1}^{L} \log p(o_{u+j} \mid h_u, a_{u:u+j-1}), \qquad u \sim U\{1, \dots, T - 1\}
@@ -157,6 +157,6 @@ class VectorModel(BeliefModel):
         rows, inside = row[:, None], index.clamp(max=time - 1)
         counts = mask[rows, inside] & (index < time)  # (B, L)
         begin = State(hidden[row, start], self.nothing.expand(batch, -1))
-        features = self.imagine(begin, seen.action[rows, inside]).features  # (B, L, H)
-        log_likelihood = self.log_likelihood(features, seen.target[rows, inside])
+        features = self.imagine(begin, encoded.action[rows, inside]).features  # (B, L, H)
+        log_likelihood = self.log_likelihood(features, encoded.target[rows, inside])
         return -(log_likelihood * counts).sum() / counts.sum().clamp(min=1)

@@ -19,7 +19,7 @@ from torch.nn.functional import linear
 
 from forbes.performance.fusion import Elementwise, after_affine, keep
 
-__all__ = ["Affine", "Bind", "Loop", "bind_now"]
+__all__ = ["Affine", "Bind", "TimeLoop", "bind_now"]
 
 Affine: TypeAlias = Callable[..., Any]
 """x `(*, in)` and what else `then` takes, to then(W x + b, ...); W x + b is `(*, out)`."""
@@ -37,7 +37,7 @@ def bind_now(weight: Tensor, bias: Tensor, then: Elementwise = keep) -> Affine:
     return lambda x, *more: then(linear(x, weight, bias), *more)
 
 
-class Loop:
+class TimeLoop:
     """A loop over `steps` steps of `(batch, in)` inputs, to which affine maps are bound."""
 
     def __init__(self, steps: int, batch: int) -> None:

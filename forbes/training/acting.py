@@ -8,21 +8,21 @@ from typing import Any, Self
 
 from torch import Tensor
 
-from forbes.control.agent import Agent, Choice
+from forbes.control.agent import ActionSelector, Agent
 from forbes.control.policy import ScalarHead
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.data.episodes.collection import episode_seed, play_whole
 from forbes.data.episodes.episode import Episode
 from forbes.envs import Environment
 from forbes.errors import ForbesError
-from forbes.models import Filtered, Seen, StateSpaceModel
+from forbes.models import EncodedSequence, Filtered, StateSpaceModel
 from forbes.models.networks import activate
 from forbes.training.world_model import Objective, WorldModel, require_at_least
 
-__all__ = ["Acting", "ActingModel", "play_measured"]
+__all__ = ["AgentPolicy", "WorldModelAgent", "play_measured"]
 
 
-class ActingModel(WorldModel, ABC):
+class WorldModelAgent(WorldModel, ABC):
     r"""A world model with rewards: :math:`p(r_t \mid f_t) = N(\hat r(f_t), \sigma_r^2)` with the features `f = [h, s]`.
 
     .. math:: L_{model} = -J_{Model} - \overline{\log p(r_t \mid f_t)}
@@ -78,27 +78,29 @@ class ActingModel(WorldModel, ABC):
         return super().for_data(data, **({"discrete": data.discrete} | options))
 
     @property
-    def foresees_ends(self) -> bool:
+    def predicts_termination(self) -> bool:
         """Whether it learns where episodes end by themselves."""
         return False
 
     @abstractmethod
-    def choose(self, exploring: bool) -> Choice:
+    def action_selector(self, exploring: bool) -> ActionSelector:
         """Return how to act: with exploration, to learn from it, or as well as the agent can."""
 
     def objectives(self, batch: SequenceBatch) -> list[Objective]:
         """See `WorldModel.objectives`: that of the world model."""
-        seen, filtered = self.follow(batch)
-        return [lambda: self.model_objective(filtered, seen, batch)]
+        encoded, filtered = self.follow(batch)
+        return [lambda: self.model_objective(filtered, encoded, batch)]
 
-    def follow(self, batch: SequenceBatch) -> tuple[Seen, Filtered]:
+    def follow(self, batch: SequenceBatch) -> tuple[EncodedSequence, Filtered]:
         """Encode a batch, and draw a trajectory of the posterior along it."""
-        seen = self.model.see(batch.observation, batch.action)
-        return seen, self.model.filter(seen.embedding, seen.action)
+        encoded = self.model.encode(batch.observation, batch.action)
+        return encoded, self.model.filter(encoded.embedding, encoded.action)
 
-    def model_objective(self, filtered: Filtered, seen: Seen, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
+    def model_objective(
+        self, filtered: Filtered, encoded: EncodedSequence, batch: SequenceBatch
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of model and reward in nats per step, and what is logged of it, along a trajectory."""
-        terms = self.model.bound(filtered, seen, batch.mask, self.kl)
+        terms = self.model.bound(filtered, encoded, batch.mask, self.kl)
         means = {name: terms.mean_over_steps(values) for name, values in self.log_probs(filtered, batch).items()}
         loss = self.loss(terms) - sum(means.values())
         return loss, self.measures(terms) | {name: mean.detach() for name, mean in means.items()}
@@ -110,23 +112,23 @@ class ActingModel(WorldModel, ABC):
 
 
 @dataclass(frozen=True)
-class Acting:
+class AgentPolicy:
     """Makes the policy by which an agent plays an episode: a `MakePolicy` that can be pickled."""
 
-    agent: ActingModel
+    agent: WorldModelAgent
     exploring: bool
 
     @classmethod
-    def as_it_is(cls, agent: ActingModel, exploring: bool) -> Self:
+    def as_it_is(cls, agent: WorldModelAgent, exploring: bool) -> Self:
         """Take a copy, on the CPU, that does not learn any further."""
         return cls(copy.deepcopy(agent).cpu().eval(), exploring)
 
     def __call__(self, environment: Environment, seed: int) -> Agent:
         """See `MakePolicy`."""
-        return Agent(self.agent.model, self.agent.choose(self.exploring), seed, self.agent.acting_samples)
+        return Agent(self.agent.model, self.agent.action_selector(self.exploring), seed, self.agent.acting_samples)
 
 
-def play_measured(agent: ActingModel, environment: Environment, purpose: str, seed: int, number: int) -> Episode:
+def play_measured(agent: WorldModelAgent, environment: Environment, purpose: str, seed: int, number: int) -> Episode:
     """Play an episode without exploration; it is a function of purpose, seed, number and the weights.
 
     Args:
@@ -139,4 +141,4 @@ def play_measured(agent: ActingModel, environment: Environment, purpose: str, se
     Raises:
         ForbesError: where it breaks three times.
     """
-    return play_whole(environment, Acting(agent, exploring=False), episode_seed(seed, number, purpose), number)
+    return play_whole(environment, AgentPolicy(agent, exploring=False), episode_seed(seed, number, purpose), number)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
-from forbes.control.agent import Choice, explore, take_mode
+from forbes.control.agent import ActionSelector, explore, greedy
 from forbes.control.imagination import belief_samples
 from forbes.control.policy import Actor, Policy, ScalarHead
 from forbes.control.returns import actor_loss, critic_loss, lambda_returns
@@ -15,13 +15,13 @@ from forbes.errors import ForbesError
 from forbes.frozen import frozen
 from forbes.models import Filtered, State
 from forbes.models.networks import activate
-from forbes.training.acting import ActingModel
+from forbes.training.acting import WorldModelAgent
 from forbes.training.world_model import Group, Objective, require_at_least
 
 __all__ = ["ImaginationActorCritic"]
 
 
-class ImaginationActorCritic(ActingModel):
+class ImaginationActorCritic(WorldModelAgent):
     r"""Learns to act on beliefs (paper §3.2, algorithm 1). Dreamer is the same with `GaussianBelief` and N = 1.
 
     Three losses, taken at the same parameters and minimised in one step; each trains its own networks only:
@@ -58,7 +58,7 @@ class ImaginationActorCritic(ActingModel):
         critic_layers: hidden layers of the critic.
         actor_rate: learning rate of the actor.
         critic_rate: learning rate of the critic.
-        **acting: arguments of `ActingModel` and `WorldModel`; their learning rate is that of model and reward.
+        **acting: arguments of `WorldModelAgent` and `WorldModel`; their learning rate is that of model and reward.
 
     Raises:
         ForbesError: when N or a size is below 1, H below 2, or the data have no actions.
@@ -104,24 +104,24 @@ class ImaginationActorCritic(ActingModel):
         self.actor_rate, self.critic_rate, self.actor_entropy = actor_rate, critic_rate, actor_entropy
 
     @property
-    def foresees_ends(self) -> bool:
-        """See `ActingModel.foresees_ends`."""
+    def predicts_termination(self) -> bool:
+        """See `WorldModelAgent.predicts_termination`."""
         return self.continues is not None
 
-    def choose(self, exploring: bool) -> Choice:
-        """See `ActingModel.choose`: a draw with noise, or the mode."""
-        return explore(self.actor, self.exploration) if exploring else take_mode(self.actor)
+    def action_selector(self, exploring: bool) -> ActionSelector:
+        """See `WorldModelAgent.action_selector`: a draw with noise, or the mode."""
+        return explore(self.actor, self.exploration) if exploring else greedy(self.actor)
 
     def objectives(self, batch: SequenceBatch) -> list[Objective]:
         """See `WorldModel.objectives`: the model's, and actor's and critic's; their gradients do not overlap."""
-        seen, filtered = self.follow(batch)
+        encoded, filtered = self.follow(batch)
         return [
-            lambda: self.model_objective(filtered, seen, batch),
+            lambda: self.model_objective(filtered, encoded, batch),
             lambda: self._control_objective(filtered, batch.mask & ~batch.ended),
         ]
 
     def log_probs(self, filtered: Filtered, batch: SequenceBatch) -> dict[str, Tensor]:
-        """See `ActingModel.log_probs`; with `continuation`, log p(c_t | f_t) too."""
+        """See `WorldModelAgent.log_probs`; with `continuation`, log p(c_t | f_t) too."""
         found = super().log_probs(filtered, batch)
         if self.continues is not None:
             sign = torch.where(batch.ended, -1.0, 1.0)  # (B, T)
@@ -151,7 +151,7 @@ class ImaginationActorCritic(ActingModel):
             return action
 
         with frozen(*self._world(), self.critic):
-            features = self.model.roll(start, act, self.horizon).features  # (N B T, H, F)
+            features = self.model.rollout(start, act, self.horizon).features  # (N B T, H, F)
             discount = self._discount(features)
             returns = lambda_returns(self.reward(features), self.critic(features), discount, self.lambda_)
         value = self.critic(features[:, :-1].detach())  # (N B T, H - 1)

@@ -13,7 +13,7 @@ from forbes.beliefs import BeliefFamily
 from forbes.data import SequenceBatch, SequenceDataModule, Simulated
 from forbes.errors import ForbesError
 from forbes.models.elbo import elbo_loss
-from forbes.models.known_model import KnownModel, Units
+from forbes.models.known_model import KnownModel, Standardizer
 from forbes.performance.precision import full_precision
 from forbes.pomdps import CategoricalBelief, Process
 from forbes.pomdps.base import require_positive
@@ -87,7 +87,7 @@ class KnownBelief(LightningModule):
         self.process, self.objective, self.learning_rate, self.seed = process, objective, learning_rate, seed
         state, observation, action = process.sample(_EXAMPLES, _STEPS, generator(0, "units", 0))
         inputs = torch.cat((observation, action), -1)  # (N, T, O + A)
-        units = Units(state.flatten(0, 1)), Units(inputs.flatten(0, 1))
+        units = Standardizer(state.flatten(0, 1)), Standardizer(inputs.flatten(0, 1))
         self.model = KnownModel(process, belief, *units, hidden_dim, mlp_dim, mlp_layers)
 
     @property

@@ -8,7 +8,7 @@ from forbes.data import Experience, SequenceDataModule
 from forbes.envs import EnvironmentProcess
 from forbes.errors import ForbesError
 from forbes.runs.modules import LoadedRun, open_module
-from forbes.training.acting import ActingModel
+from forbes.training.acting import WorldModelAgent
 from forbes.training.known_belief import KnownBelief
 from forbes.training.world_model import WorldModel
 
@@ -47,7 +47,7 @@ def load_known_belief(run: Path | str) -> LoadedRun[KnownBelief]:
 @contextmanager
 def loaded_agent(
     run: str, device: str, samples: int | None = None
-) -> Iterator[tuple[ActingModel, EnvironmentProcess, str]]:
+) -> Iterator[tuple[WorldModelAgent, EnvironmentProcess, str]]:
     """Load a run's agent on a device, with its environment, which is closed at the end, and its checkpoint's SHA-256.
 
     Args:
@@ -59,7 +59,7 @@ def loaded_agent(
         ForbesError: where the run is not an agent's.
     """
     module, data, _, checkpoint = open_run(run)
-    if not isinstance(module, ActingModel) or not isinstance(data.source, Experience):
+    if not isinstance(module, WorldModelAgent) or not isinstance(data.source, Experience):
         kind = type(module).__name__
         raise ForbesError(f"{run}: not the run of an agent, but of a {kind}. Name an agent's, or measure it by itself")
     module.to(device)

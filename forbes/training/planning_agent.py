@@ -2,16 +2,16 @@
 
 from typing import Any
 
-from forbes.control.agent import Choice, follow_plan, noisy
+from forbes.control.agent import ActionSelector, follow_plan, noisy
 from forbes.control.planning import CrossEntropy
 from forbes.errors import ForbesError
-from forbes.training.acting import ActingModel
+from forbes.training.acting import WorldModelAgent
 from forbes.training.world_model import require_at_least
 
 __all__ = ["PlanningAgent"]
 
 
-class PlanningAgent(ActingModel):
+class PlanningAgent(WorldModelAgent):
     """Learns the world model only, and plans in it (Hafner et al., 2019, arXiv 1811.04551), on beliefs of any family.
 
     Args:
@@ -19,7 +19,7 @@ class PlanningAgent(ActingModel):
         iterations: of the search.
         candidates: J.
         best: M, of which the next proposal is made.
-        **acting: arguments of `ActingModel` and `WorldModel`.
+        **acting: arguments of `WorldModelAgent` and `WorldModel`.
 
     Raises:
         ForbesError: when a number is below 1, `best` above `candidates`, or actions are discrete.
@@ -43,7 +43,7 @@ class PlanningAgent(ActingModel):
             raise ForbesError(f"{name}: the data's actions are discrete, expected vectors. Use ImaginationActorCritic")
         self.search = CrossEntropy(horizon, iterations, candidates, best)
 
-    def choose(self, exploring: bool) -> Choice:
-        """See `ActingModel.choose`: the plan, with noise on it or not."""
+    def action_selector(self, exploring: bool) -> ActionSelector:
+        """See `WorldModelAgent.action_selector`: the plan, with noise on it or not."""
         plan = follow_plan(self.model, self.reward, self.search)
         return noisy(plan, self.exploration) if exploring else plan

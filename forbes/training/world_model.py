@@ -191,7 +191,7 @@ class WorldModel(LightningModule):
 
     def terms(self, batch: SequenceBatch) -> ElboTerms:
         """Estimate the parts of the bound on a batch."""
-        return self.model.elbo(batch.observation, batch.action, batch.mask, self.kl)
+        return self.model.lower_bound(batch.observation, batch.action, batch.mask, self.kl)
 
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
         """Seed the noise of this batch, so that a resumed run draws the same; check an epoch's first observations."""

@@ -17,7 +17,7 @@ from forbes.beliefs import (
     GaussianBelief,
     MixtureBelief,
 )
-from forbes.performance.time_loop import Loop
+from forbes.performance.time_loop import TimeLoop
 
 CONTEXT = 3
 CLASSES = 3
@@ -275,7 +275,7 @@ def test_in_a_time_loop_the_draws_and_their_gradients_are_the_same(family):
     head, context = random_head(family, dim=4), contexts(3 * 5).view(3, 5, CONTEXT)
     results = []
 
-    for sample in (head.rsample, head.sampler(Loop(steps=3, batch=5))):
+    for sample in (head.rsample, head.sampler(TimeLoop(steps=3, batch=5))):
         torch.manual_seed(0)
         states, log_probs = zip(*(sample(step) for step in context), strict=True)
         loss = torch.stack(states).square().sum() + torch.stack(log_probs).sum()
@@ -288,7 +288,7 @@ def test_a_time_loop_compiles_to_one_graph(family):
     head, context = random_head(family).float(), contexts(2 * 3).view(2, 3, CONTEXT).float()
 
     def loss():
-        sample = head.sampler(Loop(steps=2, batch=3))
+        sample = head.sampler(TimeLoop(steps=2, batch=3))
         states, log_probs = zip(*(sample(step) for step in context), strict=True)
         return (torch.stack(log_probs) - head.log_prob(torch.stack(states) + 1, context)).square().sum()
 

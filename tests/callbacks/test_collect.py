@@ -13,9 +13,9 @@ from lightning import Trainer
 from small_agents import fit, forbes, write_config
 
 from forbes.data.episodes.store import EpisodeStore
-from forbes.data.episodes.worker import Player
+from forbes.data.episodes.worker import EpisodeWorker
 from forbes.envs import EnvironmentProcess
-from forbes.evaluation.reward_prediction import foretell, share_explained
+from forbes.evaluation.reward_prediction import predict_rewards, r2_score
 from forbes.runs.checkpoint import ResumeWholeEpochs, read_checkpoint
 from forbes.runs.folder import RunFolder, read_metrics
 from forbes.seeding import derive_seed
@@ -71,8 +71,8 @@ def test_what_the_model_foresees_is_that_of_the_episodes_that_measure_the_agent(
     played = [play_measured(module, data.source.environment, "evaluation", 0, number) for number in range(2)]
     data.source.close()
 
-    told = [foretell(module, one, derive_seed(0, "foresight", k), "", (5,))[0] for k, one in enumerate(played)]
-    share = share_explained(told, [torch.from_numpy(one.reward[1:]).double() for one in played])
+    told = [predict_rewards(module, one, derive_seed(0, "foresight", k), "", (5,))[0] for k, one in enumerate(played)]
+    share = r2_score(told, [torch.from_numpy(one.reward[1:]).double() for one in played])
 
     logged = read_metrics(run)["reward_explained/5"].dropna()
     assert len(logged) == 2  # after epochs 2 and 3, the last
@@ -415,14 +415,14 @@ def test_a_signal_before_the_training_begins_ends_it_with_an_epoch(tmp_path, mon
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_to_the_whole_group_while_the_player_starts_loses_nothing(tmp_path, monkeypatch, number):
     """The player gets it before Python has begun there; `tests/envs/test_worker.py` has the same of an environment."""
-    start = Player._start
+    start = EpisodeWorker._start
 
     def start_and_send(self):
         start(self)
         os.kill(self._process.pid, number)
         os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(Player, "_start", start_and_send)
+    monkeypatch.setattr(EpisodeWorker, "_start", start_and_send)
     (tmp_path / "agent.yaml").write_text(write_config(tmp_path).read_text().replace("{seed", "{overlap: true, seed"))
 
     assert fit("--config", tmp_path / "agent.yaml", "--run_dir", tmp_path / "run") == 128 + number

@@ -18,7 +18,7 @@ from forbes.errors import ForbesError
 from forbes.models import ConvDecoder, ConvEncoder
 from forbes.performance.fusion import fused, fusing
 from forbes.training import ImaginationActorCritic
-from forbes.training.acting import Acting
+from forbes.training.acting import AgentPolicy
 
 BATCH, TIME = 3, 4
 # The compiler looks at gradients that are not there.
@@ -129,7 +129,7 @@ def test_what_is_no_world_model_is_refused():
 def test_an_agent_that_plays_in_another_process_leaves_the_recording_behind(agent):
     vars(agent)["losses"] = lambda _: None
 
-    assert Acting.as_it_is(agent, exploring=True).agent.losses(make_batch(0))[0].isfinite()
+    assert AgentPolicy.as_it_is(agent, exploring=True).agent.losses(make_batch(0))[0].isfinite()
 
 
 def test_after_a_fit_a_module_has_its_own_losses_again(agent):

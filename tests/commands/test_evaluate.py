@@ -16,10 +16,10 @@ from forbes.commands.cli import main
 from forbes.commands.evaluate import evaluate as measure
 from forbes.errors import ForbesError
 from forbes.evaluation import scoring
-from forbes.evaluation.metrics import Measured, pair
+from forbes.evaluation.metrics import EvaluatedRun, pair
 from forbes.evaluation.references import references
 from forbes.evaluation.runs import load_runs, split_batches
-from forbes.evaluation.scoring import Parts, make_pass, score_split
+from forbes.evaluation.scoring import PartialScores, make_scorer, score_split
 from forbes.evaluation.scoring import evaluate as evaluate_model
 from forbes.runs.folder import RunFolder
 from forbes.training.loading import load_run
@@ -129,7 +129,7 @@ def test_records_the_mean_over_the_whole_split_and_every_sequence(runs):
     assert evaluate(*runs, "--batch-size", "5") == 0
 
     for run in load_runs(runs):
-        scores = score_split(run.model, split_batches(run.data, "test", 12, 5), make_pass("elbo", 2, 5, 1))
+        scores = score_split(run.model, split_batches(run.data, "test", 12, 5), make_scorer("elbo", 2, 5, 1))
         elbo, entry, array = scores.values["elbo"].sum(1), record(run.path)[NAME], arrays_of(run.path)[NAME]
         assert entry["mean"] == pytest.approx(elbo.mean().item(), rel=1e-12)
         assert entry["standard_error"] == pytest.approx(elbo.numpy().std(ddof=1) / 12**0.5)
@@ -213,7 +213,7 @@ def test_a_score_that_a_model_does_not_have_is_left_out_and_said(runs, other_fil
     module, data = load_run(vector)
     batch = data.sequences("test", torch.arange(5))
     with torch.no_grad():
-        log_p = module.model.elbo(batch.observation, batch.action, batch.mask).elbo
+        log_p = module.model.lower_bound(batch.observation, batch.action, batch.mask).elbo
     np.testing.assert_allclose(arrays_of(vector)["test[:5]/pll[bernoulli,K=4]"], log_p.numpy(), rtol=1e-6)
 
 
@@ -308,7 +308,7 @@ def test_an_interrupted_evaluation_goes_on_where_it_stopped(runs, monkeypatch):
 
 
 def test_what_an_interrupted_evaluation_left_is_not_used_for_another_checkpoint_or_seed(runs, monkeypatch):
-    monkeypatch.setattr(Parts, "remove", lambda self: None)
+    monkeypatch.setattr(PartialScores, "remove", lambda self: None)
     evaluate(runs[0])
     first = record(runs[0])[NAME]["mean"]
     evaluate(runs[0], "--seed", "1")
@@ -407,7 +407,9 @@ def evaluated(runs, number, score):
     entry = next(values for name, values in one.entries.items() if "/elbo[" in name)
     names = [runs[0], *(f"runs/compare/a-rather-long-name-of-a-run-{k}" for k in range(1, number))]
     return [
-        Measured(one.run._replace(path=name), {NAME: dict(entry)}, {NAME: one.totals["test[:5]/elbo[bernoulli,S=2]"]})
+        EvaluatedRun(
+            one.run._replace(path=name), {NAME: dict(entry)}, {NAME: one.totals["test[:5]/elbo[bernoulli,S=2]"]}
+        )
         for name in names
     ]
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from forbes.beliefs import FlowBelief, GaussianBelief
-from forbes.control.agent import Agent, explore, follow_plan, take_mode
+from forbes.control.agent import Agent, explore, follow_plan, greedy
 from forbes.control.planning import CrossEntropy
 from forbes.control.policy import Actor
 from forbes.models import MLPDecoder, MLPEncoder, StateSpaceModel, VectorNormal
@@ -25,7 +25,7 @@ def search():
 
 def choices(model, actor):
     return {
-        "mode": take_mode(actor),
+        "mode": greedy(actor),
         "explore": explore(actor, 0.3),
         "plan": follow_plan(model, lambda features: features.sum(-1), search()),
     }
@@ -57,7 +57,7 @@ def test_the_belief_is_that_of_filtering_the_whole_episode():
 
     def choose(filtered):
         seen.append(filtered)
-        return take_mode(actor)(filtered)
+        return greedy(actor)(filtered)
 
     agent = Agent(model, choose, seed=1)
     actions = torch.tensor(np.stack([agent(o) for o in OBSERVATIONS]))
@@ -76,7 +76,7 @@ def test_the_belief_is_that_of_filtering_the_whole_episode():
 
 def test_what_was_seen_long_ago_matters():
     model, actor = build()
-    one, other = (Agent(model, take_mode(actor), seed=1) for _ in range(2))
+    one, other = (Agent(model, greedy(actor), seed=1) for _ in range(2))
     changed = OBSERVATIONS.copy()
     changed[0] += 3
 
@@ -104,7 +104,7 @@ class Upwards:
 def test_many_trajectories_act_on_the_belief_and_not_on_a_guess():
     r"""After one observation the belief is N(μ, σ²): the mean action goes to 2 Φ(μ/σ) - 1, where one guess has ±1."""
     model, _ = build()
-    guess, many = (Agent(model, take_mode(Upwards(discrete=False)), 0, samples) for samples in (1, 10_000))
+    guess, many = (Agent(model, greedy(Upwards(discrete=False)), 0, samples) for samples in (1, 10_000))
 
     assert set(np.abs(guess(OBSERVATIONS[0]))) == {1.0}
     action = torch.from_numpy(many(OBSERVATIONS[0]))
@@ -119,7 +119,7 @@ def test_many_trajectories_act_on_the_belief_and_not_on_a_guess():
 
 def test_many_trajectories_take_the_discrete_action_that_most_of_them_choose():
     model, _ = build()
-    agent = Agent(model, take_mode(votes := Upwards(discrete=True)), 0, samples=9)
+    agent = Agent(model, greedy(votes := Upwards(discrete=True)), 0, samples=9)
 
     for observation in OBSERVATIONS:
         action = agent(observation)

@@ -68,7 +68,7 @@ def test_plans_on_the_beliefs_of_any_family(belief):
     model = StateSpaceModel(belief, MLPEncoder((3,), 8, 1), MLPDecoder(20, (3,), 8, 1), VectorNormal(), 2, 4, 16, 8, 1)
     search = CrossEntropy(horizon=5, iterations=2, candidates=20, best=5)
 
-    beliefs = model.beliefs(model.see(torch.randn(3, 6, 3), torch.randn(3, 6, 2)), 20)
+    beliefs = model.sample_beliefs(model.encode(torch.randn(3, 6, 3), torch.randn(3, 6, 2)), 20)
     action = plan(model, lambda features: features.sum(-1), beliefs, 2, search)
 
     assert action.shape == (3, 2)

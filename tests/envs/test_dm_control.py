@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from toy_environments import Measured
+from toy_environments import EvaluatedRun
 
 suite = pytest.importorskip("dm_control.suite")
 
@@ -158,7 +158,7 @@ def test_a_frame_of_one_colour_is_an_error_and_one_other_pixel_is_none():
 
 def test_the_buffer_is_as_large_as_the_frame(backend):
     """MuJoCo's own, of 640 x 480, costs 20 % more."""
-    make = partial(Measured, "cartpole_balance", backend=backend, size=48)
+    make = partial(EvaluatedRun, "cartpole_balance", backend=backend, size=48)
     with EnvironmentProcess(make) as environment:
         assert environment.describe()["buffer"] == [48, 48]
 

@@ -30,7 +30,7 @@ def test_the_return_is_what_the_agent_earns_without_exploration(run, capsys):
     earned = []
     for number in range(3):
         seed = derive_seed(5, "test episode", number) % 2**32
-        agent = Agent(module.model, module.choose(exploring=False), seed)
+        agent = Agent(module.model, module.action_selector(exploring=False), seed)
         actions, shown = [], [seed % 97, 0]
         for step in range(8):
             action = agent(np.array(shown, np.float32))

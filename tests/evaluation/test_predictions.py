@@ -105,7 +105,7 @@ def test_a_sample_keeps_its_own_trajectory(model, data, batch):
 
     with torch.no_grad():
         torch.manual_seed(0)
-        starts = model.beliefs(model.see(batch.observation[:, :4], batch.action[:, :4]), 3)
+        starts = model.sample_beliefs(model.encode(batch.observation[:, :4], batch.action[:, :4]), 3)
         for n in range(3):
             for b in range(5):
                 row = n * 5 + b
@@ -160,7 +160,7 @@ def test_the_mean_of_a_completion_is_that_of_many_drawings(model, written, batch
     """Along the same trajectory; drawings differ in what they draw there."""
     seen = written.sequences("test", torch.arange(1), 9)._replace(action=batch.action[:1])
     model.likelihood, model.prior.min_std, number = OnePixel(), 0.1, 4000
-    start = model.beliefs(model.see(seen.observation[:, :4], seen.action[:, :4]), 1)
+    start = model.sample_beliefs(model.encode(seen.observation[:, :4], seen.action[:, :4]), 1)
     rollout = model.imagine(start, seen.action[:, 4:])
     model.beliefs = lambda seen, samples: start
     model.imagine = lambda start, action: Rollout(*(values.repeat_interleave(len(action), 0) for values in rollout))

@@ -10,7 +10,7 @@ from forbes.data.episodes.episode import Episode
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.record import read_record
-from forbes.evaluation.reward_prediction import STEPS_AHEAD, explained, foretell
+from forbes.evaluation.reward_prediction import STEPS_AHEAD, explained, predict_rewards
 from forbes.models import Filtered, Rollout, State
 
 
@@ -51,7 +51,7 @@ def test_who_knows_the_world_foretells_each_reward_at_every_distance(steps):
     """A shift by one step, of actions, rewards or beliefs, would show: no two steps are alike."""
     episodes = [walk(steps, seed) for seed in range(3)]
 
-    foretold = [foretell(Walk(torch.square), episode, number, "") for number, episode in enumerate(episodes)]
+    foretold = [predict_rewards(Walk(torch.square), episode, number, "") for number, episode in enumerate(episodes)]
 
     for told, episode in zip(foretold, episodes, strict=True):
         for one, distance in zip(told, STEPS_AHEAD, strict=True):
@@ -64,7 +64,9 @@ def test_who_knows_the_world_foretells_each_reward_at_every_distance(steps):
 def test_who_does_not_know_what_actions_do_foretells_the_nearer_the_better():
     episodes = [walk(40, seed) for seed in range(5)]
 
-    told = [foretell(Walk(torch.square, drift=0.0), episode, number, "") for number, episode in enumerate(episodes)]
+    told = [
+        predict_rewards(Walk(torch.square, drift=0.0), episode, number, "") for number, episode in enumerate(episodes)
+    ]
     shares = [share.mean for share in explained(told, [paid(episode) for episode in episodes])]
 
     assert shares[0] == pytest.approx(1)
@@ -83,7 +85,7 @@ def test_the_mean_explains_nothing_and_what_is_further_off_less_than_that():
 
 def test_no_share_where_no_episode_is_long_enough_or_all_rewards_are_equal():
     short = [walk(6, seed) for seed in range(2)]
-    told = [foretell(Walk(torch.square), episode, 0, "") for episode in short]
+    told = [predict_rewards(Walk(torch.square), episode, 0, "") for episode in short]
 
     assert [share is None for share in explained(told, [paid(episode) for episode in short])] == [False] * 3 + [True]
 
@@ -93,7 +95,7 @@ def test_no_share_where_no_episode_is_long_enough_or_all_rewards_are_equal():
 
 def test_a_reward_that_is_not_a_number_is_said():
     with pytest.raises(ForbesError, match="run, test episode 7: the world model foretells rewards that are not finite"):
-        foretell(Walk(lambda place: place / 0), walk(6), 0, "run, test episode 7")
+        predict_rewards(Walk(lambda place: place / 0), walk(6), 0, "run, test episode 7")
 
 
 def test_a_measurement_is_recorded_and_repeated(tmp_path, capsys):

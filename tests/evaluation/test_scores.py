@@ -10,7 +10,7 @@ from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.evaluation.scores import frame_log_prob, score_particles, score_predictions, trajectories
-from forbes.evaluation.scoring import make_pass, score_split
+from forbes.evaluation.scoring import make_scorer, score_split
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, Normal, ParticleModel, StateSpaceModel
 from forbes.seeding import derive_seed
 
@@ -67,7 +67,7 @@ def float64(monkeypatch):
 
 def elbo(model, batches, samples, **options):
     """The pass that `forbes evaluate` makes; its scores summed over the steps, (N,)."""
-    scores = score_split(model, batches, make_pass("elbo", samples, 1, 1), **options)
+    scores = score_split(model, batches, make_scorer("elbo", samples, 1, 1), **options)
     return {name: values.sum(1) for name, values in scores.values.items()}
 
 
@@ -125,7 +125,7 @@ def plain_future(model, observation, action, context):
 def test_an_open_loop_follows_the_actions_that_were_taken():
     model, batch, context = make_model(), make_batch(), 2
 
-    scores = score_split(model, in_batches(batch, 3), make_pass("open-loop", 2, 3, context)).values
+    scores = score_split(model, in_batches(batch, 3), make_scorer("open-loop", 2, 3, context)).values
 
     with torch.no_grad():
         futures = [plain_future(model, o, a, context) for o, a in zip(batch.observation, batch.action, strict=True)]
@@ -152,7 +152,7 @@ def test_its_samples_are_estimates_of_the_bound_that_is_trained(belief):
         torch.manual_seed(3)
         drawn = list(trajectories(model, batch, 3, predict=False))
         torch.manual_seed(3)
-        expected = [model.elbo(batch.observation, batch.action, batch.mask) for _ in range(3)]
+        expected = [model.lower_bound(batch.observation, batch.action, batch.mask) for _ in range(3)]
 
     for trajectory, terms in zip(drawn, expected, strict=True):
         torch.testing.assert_close(trajectory.reconstruction, terms.reconstruction)
@@ -172,7 +172,7 @@ def test_encoder_and_likelihood_share_one_reading_of_a_frame():
         torch.manual_seed(3)
         (trajectory,) = trajectories(model, batch, 1, predict=False)
         torch.manual_seed(3)
-        terms = model.elbo(batch.observation, batch.action, batch.mask)
+        terms = model.lower_bound(batch.observation, batch.action, batch.mask)
 
     torch.testing.assert_close(trajectory.reconstruction, terms.reconstruction)
     torch.testing.assert_close(trajectory.kl, terms.kl)
@@ -184,7 +184,7 @@ def test_the_fivo_bound_is_the_one_that_particles_are_trained_by():
     scores = score_particles(model, batch, 5)
     torch.manual_seed(3)
     with torch.no_grad():
-        terms = model.elbo(batch.observation, batch.action, batch.mask)
+        terms = model.lower_bound(batch.observation, batch.action, batch.mask)
 
     torch.testing.assert_close(scores["fivo"].sum(1), terms.elbo)
     assert (scores["ess"][batch.mask] < 0.5).any()
@@ -196,10 +196,10 @@ def test_a_prediction_of_weighted_particles_is_their_weighted_mean():
     scores = score_predictions(model, batch, 10)  # two sets
 
     torch.manual_seed(3)
-    seen = model.see(batch.observation, batch.action)
+    seen = model.encode(batch.observation, batch.action)
     likelihood = 0
     with torch.no_grad():
-        for features, log_weight in (model.predictions(seen) for _ in range(2)):
+        for features, log_weight in (model.predict_one_step(seen) for _ in range(2)):
             log_prob = torch.stack([model.log_likelihood(some, seen.target) for some in features])  # (K, B, T)
             likelihood += (log_weight.exp() * log_prob.exp()).sum(0) / 2
     torch.testing.assert_close(scores["pll"], likelihood.log() * batch.mask)
@@ -212,7 +212,7 @@ def test_the_reported_value_is_the_mean_over_samples_and_depends_on_the_seed_alo
 
     with torch.no_grad():
         torch.manual_seed(derive_seed(2, "evaluation", 0))
-        bounds = [model.elbo(batch.observation, batch.action, batch.mask).elbo for _ in range(4)]
+        bounds = [model.lower_bound(batch.observation, batch.action, batch.mask).elbo for _ in range(4)]
 
     torch.testing.assert_close(mine, torch.stack(bounds).mean(0))
     assert (elbo(model, in_batches(batch, 7), samples=4, seed=3)["elbo"] != mine).all()
@@ -224,7 +224,7 @@ def test_what_lies_on_padding_does_not_count():
 
     assert not torch.equal(other, batch.observation)
     for name, number in [("elbo", 2), ("pll", 2), ("fivo", 3), ("open-loop", 2)]:
-        score = make_pass(name, number, 4, context=2)
+        score = make_scorer(name, number, 4, context=2)
         true, changed = (
             score_split(model, in_batches(batch._replace(observation=values), 4), score)
             for values in (batch.observation, other)

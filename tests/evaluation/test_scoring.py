@@ -9,7 +9,7 @@ from torch import nn
 
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.evaluation.scoring import Parts, Pass, score_split
+from forbes.evaluation.scoring import PartialScores, Scorer, score_split
 
 STEPS = 3
 
@@ -30,7 +30,7 @@ def hungry(limit, error):
             raise error
         return {"number": batch.observation[..., 0].double()}
 
-    return Pass(("number",), "K=9", function, 5)
+    return Scorer(("number",), "K=9", function, 5)
 
 
 OUT_OF_MEMORY = [
@@ -81,7 +81,7 @@ def test_an_evaluation_with_too_little_memory_is_halved_and_ends():
 
 def noise_of(seed, parts=None):
     """What a pass of noise alone gives in two batches, (10, T)."""
-    noise = Pass(("noise",), "", lambda model, batch: {"noise": torch.randn(batch.mask.shape).double()}, 5)
+    noise = Scorer(("noise",), "", lambda model, batch: {"noise": torch.randn(batch.mask.shape).double()}, 5)
     return score_split(nn.Linear(1, 1), batches(), noise, seed, parts=parts).values["noise"]
 
 
@@ -94,7 +94,7 @@ def test_every_batch_and_every_seed_has_noise_of_its_own():
 
 
 def test_a_batch_has_the_same_noise_whatever_was_scored_before(tmp_path):
-    whole, parts = noise_of(seed=0), Parts(tmp_path / "parts", "noise")
+    whole, parts = noise_of(seed=0), PartialScores(tmp_path / "parts", "noise")
     parts.write(0, {"noise": whole[:5]})  # what an interrupted evaluation has left
 
     assert torch.equal(noise_of(seed=0, parts=parts), whole)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from small_models import ACTION, BATCH, HIDDEN, MODELS, SHAPE, TIME, make_model, random_model, random_state, sequences
 
-from forbes.models import Seen, State, elbo_loss
+from forbes.models import EncodedSequence, State, elbo_loss
 
 T = 3  # a step in the middle, counted from 0
 
@@ -27,8 +27,8 @@ def changed(observation, steps):
     return other
 
 
-def cut(seen, steps):
-    return Seen(*(values[:, :steps] for values in seen))
+def cut(encoded, steps):
+    return EncodedSequence(*(values[:, :steps] for values in encoded))
 
 
 def without_gradient(model):
@@ -41,7 +41,7 @@ def test_a_prediction_has_seen_what_was_before_it_and_nothing_else(kind):
     steered[:, T] += 1
 
     first, of_frame, of_action = (
-        seeded(model.predictions, model.see(*inputs))
+        seeded(model.predictions, model.encode(*inputs))
         for inputs in [(observation, action), (changed(observation, T), action), (observation, steered)]
     )
 
@@ -55,7 +55,7 @@ def test_a_prediction_has_seen_what_was_before_it_and_nothing_else(kind):
 def test_the_particles_of_a_prediction_weigh_one_together(kind):
     model, (observation, action, _) = random_model(kind), sequences()
 
-    features, log_weight = seeded(model.predictions, model.see(observation, action))
+    features, log_weight = seeded(model.predictions, model.encode(observation, action))
 
     assert features.shape[:3] == log_weight.shape == (model.particles, BATCH, TIME)
     torch.testing.assert_close(log_weight.exp().sum(0), torch.ones(BATCH, TIME, dtype=torch.float64))
@@ -74,10 +74,10 @@ def test_the_bound_of_a_prefix_is_the_prefix_of_the_bound(kind):
 
 def test_a_belief_depends_on_all_that_was_seen_and_nothing_more(kind):
     model, (observation, action, _) = random_model(kind), sequences()
-    belief = seeded(model.beliefs, cut(model.see(observation, action), T), 4)
+    belief = seeded(model.beliefs, cut(model.encode(observation, action), T), 4)
 
     for step in range(TIME):
-        other = seeded(model.beliefs, cut(model.see(changed(observation, step), action), T), 4)
+        other = seeded(model.beliefs, cut(model.encode(changed(observation, step), action), T), 4)
         same = all(map(torch.equal, belief, other))
         assert same == (step >= T)
 
@@ -86,11 +86,11 @@ def test_beliefs_keep_the_sequence_they_belong_to(kind):
     """Draws are sample-major: with all sequences the same but one, its rows are the ones that differ."""
     model, (observation, action, _) = random_model(kind), sequences()
     observation[:], action[:] = observation[:1].clone(), action[:1].clone()
-    seen = model.see(observation, action)
+    encoded = model.encode(observation, action)
     observation[2] = 1 - observation[2]
-    others = model.see(observation, action)
+    others = model.encode(observation, action)
 
-    belief, other = (seeded(model.beliefs, each, 4) for each in (seen, others))
+    belief, other = (seeded(model.beliefs, each, 4) for each in (encoded, others))
 
     assert len(belief.hidden) == len(belief.state) == 4 * BATCH
     differs = (belief.hidden != other.hidden).any(-1).view(4, BATCH)
@@ -100,7 +100,7 @@ def test_beliefs_keep_the_sequence_they_belong_to(kind):
 def test_beliefs_of_a_model_with_a_state_differ(kind):
     model, (observation, action, _) = random_model(kind), sequences()
 
-    belief = torch.cat(seeded(model.beliefs, model.see(observation, action), 3 * model.particles), -1)
+    belief = torch.cat(seeded(model.beliefs, model.encode(observation, action), 3 * model.particles), -1)
 
     if MODELS[kind].keywords.get("state_dim") == 0:
         assert len(belief.unique(dim=0)) == BATCH
@@ -123,8 +123,8 @@ def test_imagination_keeps_its_rows_apart(kind, same_noise):
 def test_a_batch_of_one_equals_that_row_of_a_batch(kind, same_noise):
     model, (observation, action, mask) = random_model(kind), sequences()
 
-    batch = model.elbo(observation, action, mask)
-    row = model.elbo(observation[2:3], action[2:3], mask[2:3])
+    batch = model.lower_bound(observation, action, mask)
+    row = model.lower_bound(observation[2:3], action[2:3], mask[2:3])
 
     torch.testing.assert_close(row.reconstruction, batch.reconstruction[2:3], rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(row.kl, batch.kl[2:3], rtol=1e-6, atol=1e-6)
@@ -133,7 +133,7 @@ def test_a_batch_of_one_equals_that_row_of_a_batch(kind, same_noise):
 def test_gradients_reach_every_parameter(kind):
     model = random_model(kind)
 
-    elbo_loss(model.elbo(*sequences())).backward()
+    elbo_loss(model.lower_bound(*sequences())).backward()
 
     assert without_gradient(model) == []
 
@@ -145,7 +145,7 @@ def test_gradients_of_an_untrained_model_reach_every_parameter_at_the_second_upd
 
     for _ in range(2):
         optimizer.zero_grad()
-        elbo_loss(model.elbo(*sequences())).backward()
+        elbo_loss(model.lower_bound(*sequences())).backward()
         optimizer.step()
 
     assert without_gradient(model) == []
@@ -160,7 +160,7 @@ def test_padding_changes_neither_loss_nor_gradients(kind):
 
     for inputs in [(observation, action), (noisy_observation, noisy_action)]:
         torch.manual_seed(0)
-        loss = elbo_loss(model.elbo(*inputs, mask), free_nats=0.1, free_nats_per="element")
+        loss = elbo_loss(model.lower_bound(*inputs, mask), free_nats=0.1, free_nats_per="element")
         results.append((loss, *torch.autograd.grad(loss, list(model.parameters()))))
 
     torch.testing.assert_close(results[0], results[1], rtol=0, atol=0)
@@ -180,7 +180,7 @@ def test_a_process_without_actions_needs_no_dummy(kind):
     model, (observation, _, mask) = make_model(kind, action_dim=0), sequences()
     no_action = torch.zeros(BATCH, TIME, 0, dtype=torch.float64)
 
-    assert model.elbo(observation, no_action, mask).elbo.isfinite().all()
+    assert model.lower_bound(observation, no_action, mask).elbo.isfinite().all()
     assert model.imagine(model.initial(BATCH), no_action).hidden.shape == (BATCH, TIME, HIDDEN)
 
 
@@ -217,7 +217,7 @@ def test_overfits_one_batch(kind):
 
     bounds = []
     for _ in range(300):
-        terms = model.elbo(*batch)
+        terms = model.lower_bound(*batch)
         optimizer.zero_grad()
         elbo_loss(terms).backward()
         optimizer.step()

@@ -9,7 +9,7 @@ from torch import nn
 from forbes.beliefs import GaussianBelief, MixtureBelief
 from forbes.evaluation.theorem import LinearGaussian as ClosedForm
 from forbes.evaluation.theorem import elbo, exact_filter, log_evidence
-from forbes.models.known_model import KnownModel, LearnedBelief, Units
+from forbes.models.known_model import KnownModel, LearnedBelief, Standardizer
 from forbes.pomdps import LinearGaussian, MountainHike, Ungm
 
 
@@ -18,13 +18,15 @@ def made(process, belief=GaussianBelief, steps=6):
     torch.manual_seed(0)
     drawn = process.sample(50, steps, torch.Generator().manual_seed(0))
     inputs = torch.cat((drawn.observation, drawn.action), -1)
-    model = KnownModel(process, belief, Units(drawn.state.flatten(0, 1)), Units(inputs.flatten(0, 1)), 5, 8, 1)
+    model = KnownModel(
+        process, belief, Standardizer(drawn.state.flatten(0, 1)), Standardizer(inputs.flatten(0, 1)), 5, 8, 1
+    )
     return model.double(), drawn
 
 
 def test_units_have_mean_zero_and_variance_one_and_their_inverse():
     x = 7 + 30 * torch.randn(100, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    units = Units(x).double()
+    units = Standardizer(x).double()
     z = units(x)
 
     rounding = {"rtol": 0, "atol": 1e-5}  # the numbers are kept in float32
@@ -104,7 +106,9 @@ def test_the_bound_of_the_exact_filter_falls_short_by_what_the_theory_says():
     head = GaussianBelief(1, 2, min_std=0.0)
     head.parameters_of = nn.Identity()  # the context is mean and softplus⁻¹ of the standard deviation
     context = torch.cat((exact.belief.mean, exact.belief.variance.sqrt().expm1().log()), -1)
-    units = Units(torch.tensor([[-1.0], [1.0]], dtype=torch.float64) / math.sqrt(2))  # mean 0, standard deviation 1
+    units = Standardizer(
+        torch.tensor([[-1.0], [1.0]], dtype=torch.float64) / math.sqrt(2)
+    )  # mean 0, standard deviation 1
     model, _ = made(process)
     model.belief = lambda *_: LearnedBelief(head, context, units.double())
     torch.manual_seed(0)

@@ -10,7 +10,7 @@ from torch import nn
 
 from forbes.errors import ForbesError
 from forbes.models import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
-from forbes.models.networks import Perceptron, activate, transposed_kernels
+from forbes.models.networks import MLP, activate, transposed_kernels
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_an_image_is_treated_alone_as_in_a_batch(network):
 
 @pytest.mark.parametrize(("activation", "lowest"), [("relu", 0), ("elu", -1)])
 def test_perceptron_ends_with_its_activation(activation, lowest):
-    network = Perceptron(3, width=5, layers=2)
+    network = MLP(3, width=5, layers=2)
     activate(network, activation)
 
     output = network(100 * torch.randn(100, 3, generator=torch.Generator().manual_seed(0)))

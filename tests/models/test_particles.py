@@ -45,11 +45,11 @@ def kalman(observation, transition, covariance):
     """Means of p(s_t | o_1:t) and of p(s_t | o_1:t-1), each (T, 2)."""
     emission, mean, spread = EMISSION.double(), torch.zeros(2, dtype=torch.float64), torch.zeros(2, 2).double()
     filtered, predicted = [], []
-    for seen in observation:
+    for encoded in observation:
         predicted.append(transition @ mean)
         spread = transition @ spread @ transition.T + covariance
         gain = spread @ emission.T @ torch.linalg.inv(emission @ spread @ emission.T + NOISE**2 * torch.eye(3))
-        mean = predicted[-1] + gain @ (seen - emission @ predicted[-1])
+        mean = predicted[-1] + gain @ (encoded - emission @ predicted[-1])
         spread = spread - gain @ emission @ spread
         filtered.append(mean)
     return torch.stack(filtered), torch.stack(predicted)
@@ -58,7 +58,7 @@ def kalman(observation, transition, covariance):
 def seen_by(model, observation, copies):
     """The same sequence so many times."""
     stored = (observation.float() + 0.5).expand(copies, *observation.shape).unflatten(-1, (1, 1, 3))
-    return model.see(stored, torch.zeros(*stored.shape[:2], 0))
+    return model.encode(stored, torch.zeros(*stored.shape[:2], 0))
 
 
 def assert_mean_is(values, expected):
@@ -76,7 +76,7 @@ def test_one_particle_is_the_state_space_model(resampling):
     ).double()
     one.load_state_dict(plain.state_dict())
 
-    terms, expected = one.elbo(*batch), plain.elbo(*batch)
+    terms, expected = one.lower_bound(*batch), plain.lower_bound(*batch)
     gradients, plain_gradients = (
         torch.autograd.grad(each.elbo.sum(), list(model.parameters()))
         for each, model in [(terms, one), (expected, plain)]
@@ -101,10 +101,10 @@ def test_the_exponential_of_the_bound_averages_to_the_evidence(resampling):
 def test_particles_are_redrawn_in_some_sequences_and_not_in_others(resampling):
     """Without this, the tests of the bound would not see how they are redrawn."""
     model, _ = particle_model(4, resampling)
-    seen = seen_by(model, drawn(4, seed=4), 1000)
+    encoded = seen_by(model, drawn(4, seed=4), 1000)
     torch.manual_seed(0)
 
-    first, second, *_ = model._run(seen)
+    first, second, *_ = model._run(encoded)
 
     redrawn = effective_sample_size(first.log_weight) < 2
     assert 50 < redrawn.sum() < 950
@@ -129,11 +129,11 @@ def test_the_belief_is_that_of_the_kalman_filter_where_trajectories_of_the_propo
     (model, exact), observation = particle_model(500, resampling), drawn(4, seed=4)
     filtered, _ = kalman(observation, exact[0], exact[2])
     torch.manual_seed(0)
-    seen = seen_by(model, observation, 400)
+    encoded = seen_by(model, observation, 400)
 
     with torch.no_grad():
-        state = model.beliefs(seen, 20).state.view(20, 400, 2).double()
-        trajectories = StateSpaceModel.beliefs(model, seen, 20).state.view(20, 400, 2).double()
+        state = model.sample_beliefs(encoded, 20).state.view(20, 400, 2).double()
+        trajectories = StateSpaceModel.sample_beliefs(model, encoded, 20).state.view(20, 400, 2).double()
 
     assert_mean_is(state.mean(0), filtered[-1])
     with pytest.raises(AssertionError):
@@ -146,7 +146,7 @@ def test_predictions_are_those_of_the_kalman_filter(resampling):
     torch.manual_seed(0)
 
     with torch.no_grad():
-        features, log_weight = model.predictions(seen_by(model, observation, 400))
+        features, log_weight = model.predict_one_step(seen_by(model, observation, 400))
 
     state = (log_weight.double().exp()[..., None] * features[..., -2:].double()).sum(0)  # (400, T, 2)
     assert_mean_is(state, predicted)
@@ -162,10 +162,10 @@ def test_a_belief_is_drawn_as_often_as_its_weights_say(monkeypatch):
         log_weight=log_weights().expand(8, 1000),
     )
     grid_of_u(monkeypatch, 1000)
-    monkeypatch.setattr(model, "_run", lambda seen: iter([particles]))
+    monkeypatch.setattr(model, "_run", lambda encoded: iter([particles]))
 
     for samples in (1, 5):
-        drawn_states = model.beliefs(None, samples).state.flatten().long()
+        drawn_states = model.sample_beliefs(None, samples).state.flatten().long()
 
         shares = torch.bincount(drawn_states, minlength=8) / (1000 * samples)
         torch.testing.assert_close(shares.double(), log_weights()[:, 0].exp(), rtol=0, atol=1e-3)  # the grid of u
@@ -217,7 +217,7 @@ def test_the_effective_sample_size_counts_equal_weights():
 def test_hidden_and_stochastic_states_are_redrawn_together():
     """Each particle's h_t is the GRU's of the pair that its ancestor carried; all have one h_1, so take h_3."""
     model, (observation, action, _) = random_model("particles"), sequences()
-    seen = model.see(observation, action)
+    encoded = model.encode(observation, action)
     generator = torch.Generator().manual_seed(0)
     scores = 100 * torch.rand(observation.shape[1], 3, len(observation), generator=generator, dtype=torch.float64)
     scores[0] = 0  # at the first step hardly any is redrawn, then every sequence, so unequal are the weights
@@ -225,7 +225,7 @@ def test_hidden_and_stochastic_states_are_redrawn_together():
     torch.manual_seed(0)
 
     _, before, after, *_ = run_particles(
-        model, seen, 3, systematic, lambda features, target: next(given), dtype=torch.float64
+        model, encoded, 3, systematic, lambda features, target: next(given), dtype=torch.float64
     )
 
     parents = torch.cat((before.state, action[:, 2].expand(3, -1, -1)), -1)  # (3, B, D + A)
@@ -241,5 +241,5 @@ def test_what_cannot_be_is_said_in_one_sentence():
     with pytest.raises(ForbesError, match="ParticleModel: particles is 0, expected at least 1"):
         particle_model(0)
     with pytest.raises(ForbesError, match=r"100 particles or futures, expected whole sets of 8.*multiple of 8"):
-        particle_model(8)[0].draws(100)
-    assert particle_model(8)[0].draws(128) == 16
+        particle_model(8)[0].num_belief_samples(100)
+    assert particle_model(8)[0].num_belief_samples(128) == 16

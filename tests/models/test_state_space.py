@@ -51,7 +51,7 @@ def test_the_bound_and_its_gradients_are_those_of_the_plain_loop(family, activat
     if not model.posterior.reparameterised:
         kl = "monte_carlo"
 
-    terms = model.elbo(observation, action, mask, kl)
+    terms = model.lower_bound(observation, action, mask, kl)
     reconstruction, divergence = step_by_step(model, observation, action, kl)
     gradients = torch.autograd.grad(terms.elbo.sum(), list(model.parameters()))
     expected = torch.autograd.grad((reconstruction - divergence).sum(), list(model.parameters()))
@@ -67,7 +67,7 @@ def test_the_bound_and_its_gradients_are_those_of_the_plain_loop(family, activat
 def test_how_the_kl_is_differentiated_changes_no_value(family):
     model, batch = random_model(family), sequences()
 
-    found = {kl: model.elbo(*batch, kl) for kl in ("analytic", "monte_carlo", "path")}
+    found = {kl: model.lower_bound(*batch, kl) for kl in ("analytic", "monte_carlo", "path")}
 
     for kl in ("analytic", "path"):
         torch.testing.assert_close(found[kl].elbo, found["monte_carlo"].elbo)
@@ -85,7 +85,9 @@ def test_the_gradient_of_the_bound_is_the_same_on_average(family, kl):
 
     def gradient(kl, seed):
         torch.manual_seed(seed)
-        return torch.cat([g.flatten() for g in torch.autograd.grad(elbo_loss(model.elbo(*batch, kl)), parameters)])
+        return torch.cat(
+            [g.flatten() for g in torch.autograd.grad(elbo_loss(model.lower_bound(*batch, kl)), parameters)]
+        )
 
     batch = (observation[:2, :3].repeat(8, 1, 1, 1, 1), action[:2, :3].repeat(8, 1, 1), mask[:2, :3].repeat(8, 1))
     plain, other = (torch.stack([gradient(each, seed) for seed in range(number)]) for each in ("monte_carlo", kl))
@@ -145,8 +147,8 @@ def test_no_step_sees_later_observations_or_actions(family):
 
     for belief, sees_observation in [(filtered.hidden, t - 1), (filtered.state, t), (filtered.log_prob, t)]:
         by_embedding, by_action = torch.autograd.grad(belief[:, t].sum(), (embedding, action), retain_graph=True)
-        seen = by_embedding.ne(0).any(-1).any(0)
-        assert seen.tolist() == [step <= sees_observation for step in range(TIME)]
+        encoded = by_embedding.ne(0).any(-1).any(0)
+        assert encoded.tolist() == [step <= sees_observation for step in range(TIME)]
         assert by_action.ne(0).any(-1).any(0).tolist() == [step <= t for step in range(TIME)]
 
 
@@ -163,7 +165,7 @@ def test_an_untrained_flow_model_equals_the_gaussian_one_in_every_term():
         torch.manual_seed(0)
         filtered = model.filter(model.embed(observation), action)
         torch.manual_seed(0)
-        terms = model.elbo(observation, action, mask)
+        terms = model.lower_bound(observation, action, mask)
         rollout = model.imagine(filtered.at(-1), action)
         results.append((*filtered, model.prior_log_prob(filtered), terms.reconstruction, terms.kl, *rollout))
 
@@ -175,7 +177,7 @@ def test_a_second_backward_pass_gives_the_same_gradients(family):
     """Also after a pass that wants the gradients of the actions only, and one of the first steps only."""
     model, (observation, action, mask) = random_model(family), sequences()
     action.requires_grad_()
-    terms, parameters = model.elbo(observation, action, mask), list(model.parameters())
+    terms, parameters = model.lower_bound(observation, action, mask), list(model.parameters())
     loss = terms.elbo.sum()
 
     expected = torch.autograd.grad(loss, parameters, retain_graph=True)
@@ -191,7 +193,10 @@ def test_gradients_of_some_steps_are_those_of_the_plain_loop(family, same_noise)
 
     gradients, expected = (
         torch.autograd.grad(kl[:, 2].sum(), list(model.parameters()), allow_unused=True)
-        for kl in (model.elbo(observation, action, mask, "monte_carlo").kl, step_by_step(model, observation, action)[1])
+        for kl in (
+            model.lower_bound(observation, action, mask, "monte_carlo").kl,
+            step_by_step(model, observation, action)[1],
+        )
     )
 
     torch.testing.assert_close(gradients, expected)

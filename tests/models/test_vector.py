@@ -53,7 +53,7 @@ def rolled_on(model, observation, action, start, steps):
 def test_the_bound_is_the_likelihood_by_the_chain_rule(model):
     observation, action, mask = sequences()
 
-    terms = model.elbo(observation, action, mask)
+    terms = model.lower_bound(observation, action, mask)
 
     torch.testing.assert_close(terms.reconstruction, chain_rule(model, observation, action), rtol=1e-6, atol=1e-6)
     assert not terms.kl.any()
@@ -65,7 +65,7 @@ def test_the_probabilities_of_all_sequences_add_up_to_one():
     observation = symbols[torch.tensor(list(itertools.product(range(3), repeat=4)))]  # (81, 4, 3)
     mask = torch.ones(81, 4, dtype=torch.bool)
 
-    log_p = model.elbo(observation, torch.zeros(81, 4, 0), mask).elbo
+    log_p = model.lower_bound(observation, torch.zeros(81, 4, 0), mask).elbo
 
     assert log_p.double().exp().sum().item() == pytest.approx(1, abs=1e-5)  # of float32
 
@@ -79,7 +79,7 @@ def test_its_prequential_score_is_the_likelihood_for_any_number_of_particles(mod
         scores = score_predictions(model, SequenceBatch(observation, action, none[..., 0:0], mask, none, ~mask), number)
 
         assert set(scores) == {"pll"}
-        torch.testing.assert_close(scores["pll"].sum(1), model.elbo(observation, action, mask).elbo.double())
+        torch.testing.assert_close(scores["pll"].sum(1), model.lower_bound(observation, action, mask).elbo.double())
 
 
 def test_filtering_goes_on_from_where_it_stopped(model):
@@ -87,7 +87,7 @@ def test_filtering_goes_on_from_where_it_stopped(model):
     embedding = model.embed(observation)
 
     whole = model.filter(embedding, action)
-    first = model.beliefs(model.see(observation[:, :3], action[:, :3]), 1)
+    first = model.sample_beliefs(model.encode(observation[:, :3], action[:, :3]), 1)
     second = model.filter(embedding[:, 3:], action[:, 3:], first)
 
     torch.testing.assert_close(second, whole[:, 3:])
@@ -95,14 +95,14 @@ def test_filtering_goes_on_from_where_it_stopped(model):
 
 def test_the_first_imagined_step_is_the_prediction_and_later_ones_see_nothing(model):
     observation, action, _ = sequences()
-    seen = model.see(observation, action)
-    belief = model.beliefs(model.see(observation[:, :3], action[:, :3]), 2)
+    encoded = model.encode(observation, action)
+    belief = model.sample_beliefs(model.encode(observation[:, :3], action[:, :3]), 2)
 
     rollout = model.imagine(belief, action[:, 3:].repeat(2, 1, 1))
 
     features = rollout.features.view(2, BATCH, TIME - 3, HIDDEN)
     torch.testing.assert_close(features[0], features[1])
-    torch.testing.assert_close(features[0, :, 0], model.predictions(seen).features[0, :, 3])
+    torch.testing.assert_close(features[0, :, 0], model.predict_one_step(encoded).features[0, :, 3])
     hidden = features[0, :, 0]
     for t in range(4, TIME):
         inputs = torch.cat((model.nothing.expand(BATCH, -1), action[:, t]), -1)
@@ -118,7 +118,7 @@ def test_overshooting_is_the_mean_over_the_steps_after_a_start_of_each_sequences
     for row, length in enumerate(lengths):
         mask[row, length:] = False
 
-    loss = model.elbo(observation, action, mask).auxiliary["overshoot"]
+    loss = model.lower_bound(observation, action, mask).auxiliary["overshoot"]
 
     total, steps = torch.zeros((), dtype=torch.float64), 0
     for row, length in enumerate(lengths):
@@ -141,20 +141,20 @@ def test_every_step_but_the_last_is_a_start_sooner_or_later(model):
     model.imagine = note
     torch.manual_seed(0)
     for _ in range(20):  # of five sequences: one of five starts is missed with probability 5 (4/5)^100 = 1e-9
-        model.elbo(observation, action, mask)
+        model.lower_bound(observation, action, mask)
 
     assert starts == set(range(TIME - 1))
 
 
 def test_overshooting_teaches_what_to_do_without_observations(model):
-    terms = model.elbo(*sequences())
+    terms = model.lower_bound(*sequences())
 
     (by_overshoot,) = torch.autograd.grad(terms.auxiliary["overshoot"], model.nothing, retain_graph=True)
     (by_later_steps,) = torch.autograd.grad(terms.reconstruction[:, 1:].sum(), model.nothing, retain_graph=True)
     parts = torch.autograd.grad(elbo_loss(terms), model.nothing)[0]
 
     assert by_overshoot.ne(0).any()
-    (by_bound,) = torch.autograd.grad(-model.elbo(*sequences()).reconstruction.mean(), model.nothing)
+    (by_bound,) = torch.autograd.grad(-model.lower_bound(*sequences()).reconstruction.mean(), model.nothing)
     torch.testing.assert_close(parts, by_bound + by_overshoot, rtol=1e-4, atol=1e-6)
     assert by_later_steps.ne(0).any()  # through h_1
 
@@ -162,7 +162,7 @@ def test_overshooting_teaches_what_to_do_without_observations(model):
 def test_sequences_of_one_step_have_nothing_to_roll_on(model):
     observation, action, mask = (values[:, :1] for values in sequences())
 
-    terms = model.elbo(observation, action, mask)
+    terms = model.lower_bound(observation, action, mask)
 
     assert terms.auxiliary["overshoot"] == 0
     assert elbo_loss(terms).isfinite()

@@ -66,7 +66,7 @@ def gradients(loss, modules):
 def test_the_world_model_learns_from_its_own_loss_only(reward_std):
     ours, batch = agent(reward_std=reward_std), make_batch()
     torch.manual_seed(1)
-    seen = ours.model.see(batch.observation, batch.action)
+    seen = ours.model.encode(batch.observation, batch.action)
     filtered = ours.model.filter(seen.embedding, seen.action)
     terms = ours.model.bound(filtered, seen, batch.mask)
     reward = torch.distributions.Normal(ours.reward(filtered.features), reward_std).log_prob(batch.reward)

@@ -10,7 +10,7 @@ from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.models import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder, Normal, VectorNormal
 from forbes.training import ImaginationActorCritic, PlanningAgent
-from forbes.training.acting import ActingModel
+from forbes.training.acting import WorldModelAgent
 
 BATCH, TIME = 3, 2
 
@@ -19,7 +19,7 @@ BATCH, TIME = 3, 2
 def quiet(monkeypatch):
     """Without a trainer there is nowhere to log to."""
     for name in ("log", "log_dict"):
-        monkeypatch.setattr(ActingModel, name, lambda *args, **kwargs: None)
+        monkeypatch.setattr(WorldModelAgent, name, lambda *args, **kwargs: None)
 
 
 @pytest.fixture(autouse=True)

@@ -86,12 +86,12 @@ def test_beliefs_and_their_densities_are_those_of_float32(belief):
     """To the last bit, given what the encoder has said."""
     model: StateSpaceModel = make(belief=belief).model
     batch = make_batch()
-    seen = model.see(batch.observation, batch.action)
+    seen = model.encode(batch.observation, batch.action)
 
     def densities():
         filtered = model.filter(seen.embedding, seen.action)
         terms = model.bound(filtered, seen, batch.mask)
-        rolled = model.roll(filtered.at(-1), lambda features: features[:, :2], 3)
+        rolled = model.rollout(filtered.at(-1), lambda features: features[:, :2], 3)
         return [*filtered, terms.kl, terms.analytic_kl, model.prior_log_prob(filtered), *rolled]
 
     full, ours = in_both(densities)

@@ -11,8 +11,8 @@ from forbes.choices import LONGEST
 from forbes.data.episodes.collection import MakePolicy, collect_episodes, describe_environment, episode_seed
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter, first_held
 from forbes.data.episodes.episode import EpisodeRecord
-from forbes.data.episodes.worker import Player
-from forbes.data.episodes.replay import Replay, Windows
+from forbes.data.episodes.worker import EpisodeWorker
+from forbes.data.episodes.replay import Replay, Segments
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.envs import TIME_LIMIT, EnvironmentProcess, find_environment
 from forbes.errors import ForbesError
@@ -70,9 +70,9 @@ class Experience(SequenceSource):
         return EnvironmentProcess(self._make, self.timeout, self.time_limit)
 
     @cached_property
-    def player(self) -> Player:
+    def player(self) -> EpisodeWorker:
         """What plays while this process trains; it starts when it is first asked for."""
-        return Player(self._make, self.timeout, self.time_limit)
+        return EpisodeWorker(self._make, self.timeout, self.time_limit)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:  # type: ignore[override]
@@ -216,11 +216,11 @@ class Experience(SequenceSource):
         """See `Replay.latest`."""
         return self._drawn().latest(count)
 
-    def gather(self, split: Split, index: Tensor, length: int) -> Windows:
+    def gather(self, split: Split, index: Tensor, length: int) -> Segments:
         """See `Replay.gather`."""
         return self._drawn().gather(split, index, length)
 
-    def decode(self, compact: Windows) -> SequenceBatch:
+    def decode(self, compact: Segments) -> SequenceBatch:
         """See `Replay.decode`."""
         return self._drawn().decode(compact)
 

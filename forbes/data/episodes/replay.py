@@ -15,11 +15,11 @@ from forbes.errors import ForbesError
 from forbes.seeding import generator
 from forbes.shapes import printed_by_shape
 
-__all__ = ["Replay", "Windows"]
+__all__ = ["Replay", "Segments"]
 
 
 @printed_by_shape
-class Windows(NamedTuple):
+class Segments(NamedTuple):
     """Some windows as they are stored."""
 
     observation: Tensor
@@ -157,7 +157,7 @@ class Replay(SequenceSource):
         table = self._require("train")
         return (table.ends - table.lengths).flip(0)[:count]  # a training window begins at every observation
 
-    def gather(self, split: Split, index: Tensor, length: int) -> Windows:
+    def gather(self, split: Split, index: Tensor, length: int) -> Segments:
         """Copy windows by index, int64 (B,), from the mapped files."""
         if length < 1:
             raise ForbesError(f"Replay: length is {length}, expected at least 1 step.")
@@ -178,9 +178,9 @@ class Replay(SequenceSource):
             action[window, there], reward[window, there] = episode.action[steps], episode.reward[steps]
             mask[window, there] = True
             ended[window, end - begin - 1] = episode.terminated and end == len(episode.reward)
-        return Windows(*map(torch.from_numpy, (observation, action, reward, mask, ended)))
+        return Segments(*map(torch.from_numpy, (observation, action, reward, mask, ended)))
 
-    def decode(self, compact: Windows) -> SequenceBatch:
+    def decode(self, compact: Segments) -> SequenceBatch:
         """Add the state, which is not known."""
         observation, action, reward, mask, ended = compact
         return SequenceBatch(observation, action, reward, mask, reward.new_zeros(*reward.shape, 0), ended)

@@ -15,10 +15,10 @@ from forbes.data.episodes.episode import Episode
 from forbes.envs import TIME_LIMIT, Environment, EnvironmentProcess
 from forbes.errors import ForbesError
 
-__all__ = ["Player"]
+__all__ = ["EpisodeWorker"]
 
 
-class Player:
+class EpisodeWorker:
     """Plays one episode at a time in a process of its own, on the CPU, with one thread.
 
     The environment lives in a process below that one, as it does below this one without a player. A process that dies

@@ -126,7 +126,7 @@ def draw_finished(digits: Digits) -> tuple[Tensor, Tensor]:
         Frames, `(N, 1, H, W)`, and the shares of the classes, `(N, 10)`.
     """
     shift = torch.randint(-_SHIFT, _SHIFT + 1, (2,)).tolist()
-    frames = _worn(digits.frames(digits.points)).roll(shift, (2, 3))
+    frames = _augment(digits.frames(digits.points)).roll(shift, (2, 3))
     share = torch.distributions.Dirichlet(torch.ones(3)).sample((len(frames),)).T  # (3, N)
     share[:, : len(frames) // 2] = torch.eye(3)[:, :1]
     return _blend(frames, share), _blend(_shares(digits), share)
@@ -144,10 +144,10 @@ def _shares(digits: Digits) -> Tensor:
 def draw_prefix(digits: Digits) -> tuple[Tensor, Tensor]:
     """Draw the beginnings of digits, of a random number of points each, worn, `(N, 2, H, W)`, with their classes."""
     points = 1 + (torch.rand(len(digits.points)) * digits.points).long()  # (N,)
-    return _worn(digits.histories(points)), _shares(digits)
+    return _augment(digits.histories(points)), _shares(digits)
 
 
-def _worn(frames: Tensor) -> Tensor:
+def _augment(frames: Tensor) -> Tensor:
     """Wear strokes as a model may: up to a tenth of the pixels lost, up to half of the ink spread over neighbours."""
     lost, spread = 0.1 * torch.rand(len(frames), 1, 1, 1), 0.5 * torch.rand(len(frames), 1, 1, 1)
     kept = frames * (torch.rand_like(frames[:, :1]) >= lost)  # (N, C, H, W)

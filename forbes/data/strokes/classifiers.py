@@ -25,8 +25,15 @@ from forbes.errors import ForbesError
 from forbes.files import npz_bytes, replace_file
 from forbes.reading import read_npz
 
-__all__ = ["CLASSES", "CLASSIFIERS_SHA256", "DigitClassifier", "Judges", "calibration_error", "classifiers_path"]
-__all__ += ["load_judges", "save_weights"]
+__all__ = [
+    "CLASSES",
+    "CLASSIFIERS_SHA256",
+    "DigitClassifier",
+    "DigitClassifiers",
+    "calibration_error",
+    "classifiers_path",
+]
+__all__ += ["load_classifiers", "save_weights"]
 
 CLASSES = 10
 CLASSIFIERS_SHA256 = "814ad34e76ac09d430373f9695a8aaee6cc9fd58e5fdabe9ce6da12f6e31933f"
@@ -62,7 +69,7 @@ class DigitClassifier(nn.Module):
         return logits.log_softmax(-1).view(*frames.shape[:-3], CLASSES)  # (*, 10)
 
 
-class Judges(NamedTuple):
+class DigitClassifiers(NamedTuple):
     """The two classifiers for a set of strokes."""
 
     finished: DigitClassifier
@@ -74,7 +81,7 @@ def classifiers_path() -> Path:
     return bundled("classifiers.npz")
 
 
-def load_judges(origin: Literal["bundled", "dejong"]) -> Judges:
+def load_classifiers(origin: Literal["bundled", "dejong"]) -> DigitClassifiers:
     """Read the classifiers for a set of strokes, in evaluation mode on the CPU.
 
     Raises:
@@ -87,7 +94,7 @@ def load_judges(origin: Literal["bundled", "dejong"]) -> Judges:
     weights = read_npz(path, remedy)
     if (found := _sha256(weights)) != CLASSIFIERS_SHA256:
         raise ForbesError(f"{path}: weights of sha256 {found[:16]}…, expected {CLASSIFIERS_SHA256[:16]}…. {remedy}")
-    judges = Judges(DigitClassifier(1), DigitClassifier(2))
+    judges = DigitClassifiers(DigitClassifier(1), DigitClassifier(2))
     for judge, name in zip(judges, ("finished", f"prefix-{origin}"), strict=True):
         judge.load_state_dict({key: torch.from_numpy(weights[f"{name}.{key}"]).float() for key in judge.state_dict()})
         judge.eval().requires_grad_(False)

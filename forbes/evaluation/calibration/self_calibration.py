@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forbes.evaluation.calibration.ranks import TwoSampleTest, ranks, tarp_ranks, two_sample_test
 from forbes.evaluation.scores import LogMeanExp
-from forbes.models import Seen, StateSpaceModel
+from forbes.models import EncodedSequence, StateSpaceModel
 from forbes.seeding import derive_seed, generator
 
 __all__ = ["SelfCalibration", "self_calibration"]
@@ -50,12 +50,12 @@ def self_calibration(model: StateSpaceModel, action: Tensor, samples: int, seed:
         torch.manual_seed(derive_seed(seed, "self-calibration", 0))
         rollout = model.imagine(model.initial(len(action)), action)
         observation = model.likelihood.sample(model.decode(rollout.features))  # (N, t, *O)
-        seen = Seen(observation, model.encode(observation), action)
+        encoded = EncodedSequence(observation, model.embed_target(observation), action)
         truth = rollout.state[:, -1]  # (N, D)
-        draws = torch.stack([model.beliefs(seen, 1).state for _ in range(samples + 1)])  # (L + 1, N, D)
+        draws = torch.stack([model.sample_beliefs(encoded, 1).state for _ in range(samples + 1)])  # (L + 1, N, D)
         of_truth, of_draws = LogMeanExp(), LogMeanExp()
         for _ in range(_COMPONENTS):
-            context = model.filter(seen.embedding, action).context[:, -1]  # (N, C)
+            context = model.filter(encoded.embedding, action).context[:, -1]  # (N, C)
             of_truth.add(model.posterior.log_prob(truth, context).double())
             of_draws.add(model.posterior.log_prob(draws[1:], context).double())
     draw = generator(seed, "ties", 0)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
-from forbes.data.strokes.classifiers import DigitClassifier, Judges
+from forbes.data.strokes.classifiers import DigitClassifier, DigitClassifiers
 from forbes.errors import ForbesError
 from forbes.evaluation.digits.neighbours import Beginnings, mean_frame
 from forbes.evaluation.digits.scores import (
@@ -34,10 +34,10 @@ from forbes.evaluation.digits.scores import (
 )
 from forbes.evaluation.predictions import complete
 from forbes.evaluation.scores import Increments
-from forbes.evaluation.scoring import Pass
+from forbes.evaluation.scoring import Scorer
 from forbes.models import BeliefModel
 
-__all__ = ["Prefixes", "judge_completions", "model_pass", "neighbour_pass", "prefixes", "summarise"]
+__all__ = ["Prefixes", "model_pass", "neighbour_pass", "prefixes", "score_completions", "summarise"]
 __all__ += ["summarise_classes", "truth_pass"]
 
 _SHARES = (60, 80)
@@ -98,7 +98,7 @@ def _history(last: Tensor, mean: Tensor) -> Tensor:
     return torch.cat((last, mean), -3)
 
 
-def model_pass(data: SequenceDataModule, context: int, samples: int, judges: Judges) -> Pass:
+def model_pass(data: SequenceDataModule, context: int, samples: int, judges: DigitClassifiers) -> Scorer:
     """Read a model's N completions.
 
     Args:
@@ -111,23 +111,23 @@ def model_pass(data: SequenceDataModule, context: int, samples: int, judges: Jud
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _to_the_end(batch)
         frames = complete(model, data.source, batch, context, samples).frames  # (N, B, T - c, 1, H, W)
-        return judge_completions(frames, _pictures(data, batch), context, data.length, judges)
+        return score_completions(frames, _pictures(data, batch), context, data.length, judges)
 
-    return Pass(_READINGS, f"c={context},N={samples}", function, _ROWS)
+    return Scorer(_READINGS, f"c={context},N={samples}", function, _ROWS)
 
 
-def truth_pass(data: SequenceDataModule, context: int, judges: Judges) -> Pass:
+def truth_pass(data: SequenceDataModule, context: int, judges: DigitClassifiers) -> Scorer:
     """Read the true digits as if they were the completions: they bound what concerns one completion alone."""
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _pictures(data, _to_the_end(batch))
         frames = batch.observation[:, context:].float().expand(_TRUTHS, -1, -1, -1, -1, -1)
-        return judge_completions(frames, batch, context, data.length, judges)
+        return score_completions(frames, batch, context, data.length, judges)
 
-    return Pass(_READINGS, f"c={context},N={_TRUTHS}", function, _ROWS)
+    return Scorer(_READINGS, f"c={context},N={_TRUTHS}", function, _ROWS)
 
 
-def neighbour_pass(data: SequenceDataModule, context: int, samples: int, judges: Judges) -> Pass:
+def neighbour_pass(data: SequenceDataModule, context: int, samples: int, judges: DigitClassifiers) -> Scorer:
     """Read, as completions, the N training digits that begin most alike: real digits, and a choice of them."""
     beginnings = Beginnings(data, context, mean_frame)
 
@@ -136,9 +136,9 @@ def neighbour_pass(data: SequenceDataModule, context: int, samples: int, judges:
         nearest = beginnings.nearest(batch.observation[:, :context], samples)  # (B, N)
         others = data.sequences("train", nearest.T.flatten(), batch.observation.shape[1]).observation
         frames = data.source.pictures(others)[:, context:].float().unflatten(0, (-1, len(nearest)))  # (N, B, T - c, …)
-        return judge_completions(frames, batch, context, data.length, judges)
+        return score_completions(frames, batch, context, data.length, judges)
 
-    return Pass(_READINGS, f"c={context},N={samples}", function, _ROWS)
+    return Scorer(_READINGS, f"c={context},N={samples}", function, _ROWS)
 
 
 def _to_the_end(batch: SequenceBatch) -> SequenceBatch:
@@ -153,8 +153,8 @@ def _pictures(data: SequenceDataModule, batch: SequenceBatch) -> SequenceBatch:
 
 
 @torch.no_grad()
-def judge_completions(
-    frames: Tensor, batch: SequenceBatch, context: int, length: int, judges: Judges
+def score_completions(
+    frames: Tensor, batch: SequenceBatch, context: int, length: int, judges: DigitClassifiers
 ) -> dict[str, Tensor]:
     """Read N completions of each of B digits.
 

@@ -11,7 +11,7 @@ from rich.table import Table
 from torch import Tensor
 
 from forbes.data import Split
-from forbes.data.strokes.classifiers import Judges, calibration_error
+from forbes.data.strokes.classifiers import DigitClassifiers, calibration_error
 from forbes.evaluation.digits.completions import (
     Prefixes,
     model_pass,
@@ -22,7 +22,7 @@ from forbes.evaluation.digits.completions import (
 )
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import TrainedRun
-from forbes.evaluation.scoring import Pass, score_split, with_progress
+from forbes.evaluation.scoring import Scorer, score_split, with_progress
 
 __all__ = ["Row", "Study", "entries", "print_study", "study"]
 
@@ -70,7 +70,7 @@ class Study(NamedTuple):
 
 
 def study(
-    runs: Mapping[str, TrainedRun], judges: Judges, prefixes: Prefixes, split: Split, samples: int, seed: int
+    runs: Mapping[str, TrainedRun], judges: DigitClassifiers, prefixes: Prefixes, split: Split, samples: int, seed: int
 ) -> Study:
     """Complete the same beginnings by every run.
 
@@ -85,7 +85,7 @@ def study(
     first = next(iter(runs.values()))
     data, length, context = first.data, first.data.length, prefixes.context
 
-    def measure(name: str, path: str | None, run: TrainedRun, score: Pass) -> Row:
+    def measure(name: str, path: str | None, run: TrainedRun, score: Scorer) -> Row:
         where = f"{name}, {split} digits in the order of their length"
         batches = with_progress(prefixes.batches(data, split), f"{name}, {context} steps seen", len(prefixes.digits))
         readings = score_split(run.model, batches, score, seed, where).values

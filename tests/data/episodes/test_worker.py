@@ -15,7 +15,7 @@ from processes import ends
 from toy_environments import Parrot, Troubled
 
 from forbes.data.episodes.collection import play
-from forbes.data.episodes.worker import Player
+from forbes.data.episodes.worker import EpisodeWorker
 from forbes.errors import ForbesError
 
 
@@ -31,7 +31,7 @@ class Said:
 
 @pytest.fixture(scope="module")
 def player():
-    with closing(Player(partial(Parrot, steps=8))) as player:
+    with closing(EpisodeWorker(partial(Parrot, steps=8))) as player:
         yield player
 
 
@@ -58,7 +58,7 @@ def test_one_episode_after_another(player):
 
 
 def test_a_broken_episode_is_played_again(tmp_path):
-    with closing(Player(partial(Troubled, "raises", tmp_path / "ledger"))) as player:
+    with closing(EpisodeWorker(partial(Troubled, "raises", tmp_path / "ledger"))) as player:
         player.begin(Said(0.5), number=0, seed=0)
         assert len(player.finish().action) == 7
 
@@ -66,7 +66,7 @@ def test_a_broken_episode_is_played_again(tmp_path):
 @pytest.mark.parametrize("trouble", ["raises", "hangs"])
 def test_an_environment_that_breaks_each_time_is_named(trouble, tmp_path):
     timeout = 1.0 if trouble == "hangs" else 60.0
-    with closing(Player(partial(Troubled, trouble, tmp_path / "ledger", times=9), timeout)) as player:
+    with closing(EpisodeWorker(partial(Troubled, trouble, tmp_path / "ledger", times=9), timeout)) as player:
         player.begin(Said(0.5), number=4, seed=0)
         with pytest.raises(ForbesError, match=f"{trouble}.* so broke episode 4 3 times, nothing of it is stored"):
             player.finish()
@@ -80,7 +80,7 @@ class Kills(Said):
 
 
 def test_a_player_that_dies_each_time_is_named():
-    with closing(Player(partial(Parrot, steps=8))) as player:
+    with closing(EpisodeWorker(partial(Parrot, steps=8))) as player:
         player.begin(Kills(0.5), number=4, seed=0)
         with pytest.raises(ForbesError, match="has died, exit code -9, 3 times in episode 4; what it said is above"):
             player.finish()
@@ -88,7 +88,7 @@ def test_a_player_that_dies_each_time_is_named():
 
 def test_a_killed_player_is_started_again_and_plays_the_same_episode(capfd):
     """Killed between two episodes."""
-    with closing(Player(partial(Parrot, steps=8))) as player:
+    with closing(EpisodeWorker(partial(Parrot, steps=8))) as player:
         os.kill(player._process.pid, signal.SIGKILL)
         player._process.join()
         player.begin(Said(0.5), number=4, seed=3)
@@ -101,7 +101,7 @@ def test_a_killed_player_is_started_again_and_plays_the_same_episode(capfd):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_to_a_player_that_starts_is_left_to_its_parent(number, capfd):
     """As a terminal sends it to the whole group: before Python has begun in the new process."""
-    with closing(Player(partial(Parrot, steps=8))) as player:
+    with closing(EpisodeWorker(partial(Parrot, steps=8))) as player:
         os.kill(player._process.pid, number)
         player.begin(Said(0.5), number=0, seed=3)
         assert len(player.finish().action) == 9
@@ -117,7 +117,7 @@ class SlowToImport:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-@pytest.mark.parametrize("kind", ["forbes.data.episodes.worker.Player", "forbes.envs.EnvironmentProcess"])
+@pytest.mark.parametrize("kind", ["forbes.data.episodes.worker.EpisodeWorker", "forbes.envs.EnvironmentProcess"])
 def test_a_process_that_still_imports_ends_with_its_parent(tmp_path, kind):
     module, _, name = kind.rpartition(".")
     program = f"""
@@ -156,7 +156,7 @@ class Told(Said):
 def test_nothing_is_left_of_a_player_closed_in_the_midst_of_an_episode(tmp_path):
     ledger, policy = tmp_path / "ledger", Told(0.5)
     policy.path = tmp_path / "process"
-    player = Player(partial(Troubled, "hangs", ledger))
+    player = EpisodeWorker(partial(Troubled, "hangs", ledger))
     player.begin(policy, number=0, seed=0)
     while not ledger.exists():  # it has begun to hang
         time.sleep(0.05)

@@ -13,7 +13,7 @@ from forbes.data import Strokes
 from forbes.data.strokes import classifier_training
 from forbes.data.strokes import classifiers as shipped
 from forbes.data.strokes.classifier_training import calibrate, classify, digits_of, draw_finished, fit, quality
-from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, calibration_error, classifiers_path, load_judges
+from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, calibration_error, classifiers_path, load_classifiers
 from forbes.errors import ForbesError
 
 DIGITS = 1000
@@ -21,7 +21,7 @@ DIGITS = 1000
 
 @pytest.fixture(scope="module")
 def judges():
-    return load_judges("bundled")
+    return load_classifiers("bundled")
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_a_truncated_file_is_refused(share, tmp_path, monkeypatch):
     monkeypatch.setattr(shipped, "classifiers_path", lambda: path)
 
     with pytest.raises(ForbesError, match=r"classifiers\.npz: truncated or not an \.npz file .* install forbes"):
-        load_judges("bundled")
+        load_classifiers("bundled")
 
 
 def test_other_weights_and_a_missing_file_are_refused(tmp_path, monkeypatch):
@@ -81,10 +81,10 @@ def test_other_weights_and_a_missing_file_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(shipped, "classifiers_path", lambda: path)
 
     with pytest.raises(ForbesError, match=r"classifiers\.npz: there is no such file\. Restore it"):
-        load_judges("bundled")
+        load_classifiers("bundled")
     np.savez(path, finished=np.zeros(3, np.float16))
     with pytest.raises(ForbesError, match=rf"weights of sha256 .*, expected {CLASSIFIERS_SHA256[:16]}"):
-        load_judges("bundled")
+        load_classifiers("bundled")
 
 
 def test_what_a_classifier_sees_is_the_last_frame_and_the_mean_of_all():
@@ -100,7 +100,7 @@ def test_what_a_classifier_sees_is_the_last_frame_and_the_mean_of_all():
 
 def test_calibration_takes_back_what_was_exaggerated(judges):
     validation = digits_of(Strokes(), "validation").take(torch.arange(500))
-    classifier = load_judges("bundled").prefix
+    classifier = load_classifiers("bundled").prefix
     calibrate(classifier, validation)
     before, _ = classify(classifier, validation, 10)
     with torch.no_grad():
@@ -156,5 +156,5 @@ def test_the_command_builds_a_file_from_both_sets_and_says_how_good_it_is(stroke
     sha256 = re.search(r"weights of sha256 (\w+), changed: put it into", lines[-1])[1]
     monkeypatch.setattr(shipped, "classifiers_path", lambda: path)
     monkeypatch.setattr(shipped, "CLASSIFIERS_SHA256", sha256)
-    accuracy = quality(*classify(load_judges("dejong").prefix, digits_of(tiny, "test"), 3)).accuracy
+    accuracy = quality(*classify(load_classifiers("dejong").prefix, digits_of(tiny, "test"), 3)).accuracy
     assert f"{accuracy:.4f}" in lines[-2]

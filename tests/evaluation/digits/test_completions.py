@@ -6,14 +6,14 @@ import torch
 
 from forbes.beliefs import GaussianBelief
 from forbes.data import SequenceDataModule, Strokes
-from forbes.data.strokes.classifiers import load_judges
+from forbes.data.strokes.classifiers import load_classifiers
 from forbes.data.strokes.file import StrokeArrays, save_strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.digits.completions import (
-    judge_completions,
     model_pass,
     neighbour_pass,
     prefixes,
+    score_completions,
     summarise,
     truth_pass,
 )
@@ -26,7 +26,7 @@ CONTEXT, LENGTH = 5, 30
 
 @pytest.fixture(scope="module")
 def judges():
-    return load_judges("bundled")
+    return load_classifiers("bundled")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_too_few_digits_that_go_on_are_an_error(data, judges):
 
 
 def test_a_model_that_completes_with_the_truth_scores_as_the_truth(model, data, beginnings, batch, judges):
-    readings = judge_completions(repeated(batch, 3), batch, CONTEXT, LENGTH, judges)
+    readings = score_completions(repeated(batch, 3), batch, CONTEXT, LENGTH, judges)
     truth = score_split(model, beginnings.batches(data, "test"), truth_pass(data, CONTEXT, judges)).values
 
     scores, expected = (summarise(each, beginnings, LENGTH) for each in (readings, truth))
@@ -93,11 +93,11 @@ def test_a_model_that_completes_with_the_truth_scores_as_the_truth(model, data, 
 
 
 def test_one_drawing_for_all_has_no_diversity_and_misses_the_label(batch, beginnings, judges):
-    clear = judge_completions(repeated(batch, 2), batch, CONTEXT, LENGTH, judges)["classes"].amax(1).argmax()
+    clear = score_completions(repeated(batch, 2), batch, CONTEXT, LENGTH, judges)["classes"].amax(1).argmax()
     end = int(batch.mask[clear].sum()) - 1
     drawing = batch.observation[clear, end].float().expand(2, len(batch.mask), batch.mask.shape[1] - CONTEXT, 1, -1, -1)
 
-    scores = summarise(judge_completions(drawing, batch, CONTEXT, LENGTH, judges), beginnings, LENGTH)
+    scores = summarise(score_completions(drawing, batch, CONTEXT, LENGTH, judges), beginnings, LENGTH)
 
     assert scores["entropy[end]"].max() < 0.05
     assert (scores["classes[end]"] == 1).all()
@@ -110,7 +110,7 @@ def test_one_drawing_for_all_has_no_diversity_and_misses_the_label(batch, beginn
 def test_a_blur_of_all_digits_is_grey_and_not_clear(batch, judges):
     blur = repeated(batch, 2).mean(1, keepdim=True).expand(-1, len(batch.mask), -1, -1, -1, -1)
 
-    readings = judge_completions(blur, batch, CONTEXT, LENGTH, judges)
+    readings = score_completions(blur, batch, CONTEXT, LENGTH, judges)
 
     assert readings["clear"].max() == 0
     assert readings["grey"].min() > 0.7
@@ -118,13 +118,13 @@ def test_a_blur_of_all_digits_is_grey_and_not_clear(batch, judges):
 
 def test_a_completion_that_turns_into_another_digit_has_not_kept_its_class(batch, beginnings, judges):
     frames = repeated(batch, 2)
-    kept = judge_completions(frames, batch, CONTEXT, LENGTH, judges)
+    kept = score_completions(frames, batch, CONTEXT, LENGTH, judges)
     place, end = torch.arange(len(batch.mask)), batch.mask.sum(1) - 1
     other = torch.stack([(beginnings.labels != label).nonzero()[0, 0] for label in beginnings.labels])
     turned = frames.clone()
     turned[:, place, end - CONTEXT] = batch.observation[other, end[other]].float()
 
-    changed = judge_completions(turned, batch, CONTEXT, LENGTH, judges)
+    changed = score_completions(turned, batch, CONTEXT, LENGTH, judges)
 
     for share in (60, 80):
         torch.testing.assert_close(changed[f"early {share}"], kept[f"early {share}"])
@@ -140,7 +140,7 @@ def test_nothing_after_the_end_of_a_digit_is_read(batch, judges):
 
     def seeded(completions):
         torch.manual_seed(0)
-        return judge_completions(completions, batch, CONTEXT, LENGTH, judges)
+        return score_completions(completions, batch, CONTEXT, LENGTH, judges)
 
     expected, found = seeded(frames), seeded(torch.where(beyond, 0.5, frames))
 
@@ -152,7 +152,7 @@ def test_pixels_are_scored_at_the_last_step_of_the_training_too(batch, judges):
     wrong = repeated(batch, 2).clone()
     wrong[:, :, LENGTH - CONTEXT - 1, 0, 0, 0] = 1  # one pixel too many, at step 30
 
-    readings = judge_completions(wrong, batch, CONTEXT, LENGTH, judges)
+    readings = score_completions(wrong, batch, CONTEXT, LENGTH, judges)
 
     reached = (batch.mask.sum(1) >= LENGTH).double()
     assert 0 < reached.mean() < 1
