@@ -25,7 +25,7 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Half an hour on 2 cores; writes what came of it.
+# Twenty minutes on 2 cores; writes what came of it.
 faults: .venv/installed-dev
 	PYTHONPATH=tests $(BIN)/python -m faults --report docs/reliability.md
 

@@ -71,7 +71,7 @@ class StateSpaceModel(BeliefModel):
         >>> model = forbes.StateSpaceModel(
         ...     forbes.GaussianBelief, forbes.MLPEncoder((3,)), forbes.MLPDecoder(20, (3,)),
         ...     forbes.VectorNormal(), action_dim=2, state_dim=4, hidden_dim=16, mlp_dim=16, mlp_layers=1)
-        >>> terms = model.elbo(torch.zeros(5, 10, 3), torch.zeros(5, 10, 2), torch.ones(5, 10, dtype=torch.bool))
+        >>> terms = model.lower_bound(torch.zeros(5, 10, 3), torch.zeros(5, 10, 2), torch.ones(5, 10, dtype=torch.bool))
         >>> terms.elbo.shape
         torch.Size([5])
     """

@@ -162,7 +162,7 @@ def test_the_mean_of_a_completion_is_that_of_many_drawings(model, written, batch
     model.likelihood, model.prior.min_std, number = OnePixel(), 0.1, 4000
     start = model.sample_beliefs(model.encode(seen.observation[:, :4], seen.action[:, :4]), 1)
     rollout = model.imagine(start, seen.action[:, 4:])
-    model.beliefs = lambda seen, samples: start
+    model.sample_beliefs = lambda seen, samples: start
     model.imagine = lambda start, action: Rollout(*(values.repeat_interleave(len(action), 0) for values in rollout))
 
     torch.manual_seed(0)

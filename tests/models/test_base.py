@@ -41,7 +41,7 @@ def test_a_prediction_has_seen_what_was_before_it_and_nothing_else(kind):
     steered[:, T] += 1
 
     first, of_frame, of_action = (
-        seeded(model.predictions, model.encode(*inputs))
+        seeded(model.predict_one_step, model.encode(*inputs))
         for inputs in [(observation, action), (changed(observation, T), action), (observation, steered)]
     )
 
@@ -55,7 +55,7 @@ def test_a_prediction_has_seen_what_was_before_it_and_nothing_else(kind):
 def test_the_particles_of_a_prediction_weigh_one_together(kind):
     model, (observation, action, _) = random_model(kind), sequences()
 
-    features, log_weight = seeded(model.predictions, model.encode(observation, action))
+    features, log_weight = seeded(model.predict_one_step, model.encode(observation, action))
 
     assert features.shape[:3] == log_weight.shape == (model.particles, BATCH, TIME)
     torch.testing.assert_close(log_weight.exp().sum(0), torch.ones(BATCH, TIME, dtype=torch.float64))
@@ -65,8 +65,8 @@ def test_the_bound_of_a_prefix_is_the_prefix_of_the_bound(kind):
     """The noise of a step does not depend on how many steps follow."""
     model, batch = random_model(kind), sequences()
 
-    whole = seeded(model.elbo, *batch)
-    prefix = seeded(model.elbo, *(values[:, :T] for values in batch))
+    whole = seeded(model.lower_bound, *batch)
+    prefix = seeded(model.lower_bound, *(values[:, :T] for values in batch))
 
     torch.testing.assert_close(prefix.reconstruction, whole.reconstruction[:, :T])
     torch.testing.assert_close(prefix.kl, whole.kl[:, :T], rtol=1e-6, atol=1e-6)  # decoded in float32
@@ -74,10 +74,10 @@ def test_the_bound_of_a_prefix_is_the_prefix_of_the_bound(kind):
 
 def test_a_belief_depends_on_all_that_was_seen_and_nothing_more(kind):
     model, (observation, action, _) = random_model(kind), sequences()
-    belief = seeded(model.beliefs, cut(model.encode(observation, action), T), 4)
+    belief = seeded(model.sample_beliefs, cut(model.encode(observation, action), T), 4)
 
     for step in range(TIME):
-        other = seeded(model.beliefs, cut(model.encode(changed(observation, step), action), T), 4)
+        other = seeded(model.sample_beliefs, cut(model.encode(changed(observation, step), action), T), 4)
         same = all(map(torch.equal, belief, other))
         assert same == (step >= T)
 
@@ -90,7 +90,7 @@ def test_beliefs_keep_the_sequence_they_belong_to(kind):
     observation[2] = 1 - observation[2]
     others = model.encode(observation, action)
 
-    belief, other = (seeded(model.beliefs, each, 4) for each in (encoded, others))
+    belief, other = (seeded(model.sample_beliefs, each, 4) for each in (encoded, others))
 
     assert len(belief.hidden) == len(belief.state) == 4 * BATCH
     differs = (belief.hidden != other.hidden).any(-1).view(4, BATCH)
@@ -100,7 +100,7 @@ def test_beliefs_keep_the_sequence_they_belong_to(kind):
 def test_beliefs_of_a_model_with_a_state_differ(kind):
     model, (observation, action, _) = random_model(kind), sequences()
 
-    belief = torch.cat(seeded(model.beliefs, model.encode(observation, action), 3 * model.particles), -1)
+    belief = torch.cat(seeded(model.sample_beliefs, model.encode(observation, action), 3 * model.particles), -1)
 
     if MODELS[kind].keywords.get("state_dim") == 0:
         assert len(belief.unique(dim=0)) == BATCH
@@ -170,8 +170,8 @@ def test_cutting_padding_off_changes_nothing(kind):
     model, (observation, action, mask) = random_model(kind), sequences()
     mask[:, 4:] = False
 
-    padded = seeded(model.elbo, observation, action, mask)
-    shorter = seeded(model.elbo, observation[:, :4], action[:, :4], mask[:, :4])
+    padded = seeded(model.lower_bound, observation, action, mask)
+    shorter = seeded(model.lower_bound, observation[:, :4], action[:, :4], mask[:, :4])
 
     torch.testing.assert_close(elbo_loss(padded), elbo_loss(shorter))
 
