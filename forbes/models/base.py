@@ -19,7 +19,7 @@ from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import MLP, Decoder, Encoder
 from forbes.shapes import printed_by_shape
 
-__all__ = ["BeliefModel", "EncodedSequence", "ModelFamily", "Prediction", "Rollout", "State"]
+__all__ = ["BeliefModel", "EncodedSequence", "FrameLogProb", "ModelFamily", "Rollout", "State"]
 
 
 @printed_by_shape
@@ -61,14 +61,9 @@ class EncodedSequence(NamedTuple):
     """a_{t-1}, `(B, T, A)`."""
 
 
-@printed_by_shape
-class Prediction(NamedTuple):
-    r"""What a belief says of every next observation: :math:`p(o_t \mid o_{<t}) = \sum_k W^k p(o_t \mid x^k)`."""
-
-    features: Tensor
-    """x, of K particles, `(K, B, T, F)`; those of step t have seen nothing after o_{t-1}."""
-    log_weight: Tensor
-    """log W, normalised over the particles, `(K, B, T)`."""
+FrameLogProb: TypeAlias = Callable[[Tensor, Tensor], Tensor]
+"""log p(o | features) in nats: features `(*, N, F)` and N targets `(N, *O)`, each scored under every leading index, to
+`(*, N)`."""
 
 
 class BeliefModel(Configurable, nn.Module, ABC):
@@ -135,8 +130,15 @@ class BeliefModel(Configurable, nn.Module, ABC):
         """Draw N of the belief over (h, s) after the last step, given all that was seen: `(N B, ...)`, sample-major."""
 
     @abstractmethod
-    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
-        """Predict every o_t from one draw of the belief after t - 1 steps, of `particles` particles."""
+    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
+        """Estimate log p(o_t | o_<t) of every step from one sample of the belief after t - 1 steps, in nats, `(B, T)`.
+
+        The exponential is unbiased, so that of several samples it is averaged. Step t depends on nothing after o_t.
+
+        Args:
+            encoded: B sequences of T steps.
+            log_likelihood: how frames are scored; evaluation has its own, in float64.
+        """
 
     @abstractmethod
     def imagine(self, start: State, action: Tensor) -> Rollout:
