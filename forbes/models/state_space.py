@@ -176,16 +176,31 @@ class StateSpaceModel(BeliefModel):
         Returns:
             T steps after `start`, which itself is not among them.
         """
-        hidden, state = start
-        made: list[tuple[Tensor, Tensor, Tensor]] = []
-        with full_precision(state):
-            sample = self.prior.sampler(TimeLoop(steps, len(state)))
+        state, states, log_probs = start, [], []
+        with full_precision(start.state):
+            step = self.prepare_imagination(len(start.state), steps)
             for _ in range(steps):
-                action = policy(torch.cat((hidden, state), -1))
-                hidden = self.gru(self.transition(torch.cat((state, action), -1)), hidden)
-                state, log_prob = sample(self.prior_context(hidden))
-                made.append((hidden, state, log_prob))
-        return Rollout(*(torch.stack(values, 1) for values in zip(*made, strict=True)))  # (B, T, ...)
+                state, log_prob = step(state, policy(torch.cat(state, -1)))
+                states.append(state)
+                log_probs.append(log_prob)
+        hidden, drawn = (torch.stack(values, 1) for values in zip(*states, strict=True))  # (B, T, H), (B, T, D)
+        return Rollout(hidden, drawn, torch.stack(log_probs, 1))
+
+    def prepare_imagination(self, batch: int, steps: int) -> Callable[[State, Tensor], tuple[State, Tensor]]:
+        """Prepare the prior for a loop of T steps over B trajectories, within `full_precision`.
+
+        Returns:
+            One step: (h, s), `(B, …)`, and the action taken there, `(B, A)`, to the next (h, s) and its log p(s | h) in
+            nats, `(B,)`.
+        """
+        sample = self.prior.sampler(TimeLoop(steps, batch))
+
+        def step(before: State, action: Tensor) -> tuple[State, Tensor]:
+            hidden = self.gru(self.transition(torch.cat((before.state, action), -1)), before.hidden)  # (B, H)
+            state, log_prob = sample(self.prior_context(hidden))
+            return State(hidden, state), log_prob
+
+        return step
 
     def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
         """See `BeliefModel.sample_beliefs`: each from its own posterior trajectory, for h is random too."""
