@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 from forbes.beliefs import BeliefFamily, FlowBelief
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.errors import require_at_least
-from forbes.models.base import ModelFamily
+from forbes.models.base import ModelFamily, ModelParts
 from forbes.models.elbo import KL, ElboTerms, FreeNats, elbo_loss
 from forbes.models.likelihoods import Likelihood, Normal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
@@ -112,16 +112,18 @@ class WorldModel(SeededModule):
         likelihood = likelihood or Normal()
         require_rank(likelihood, observation_shape)
         self.model = model(
-            belief,
-            encoder(observation_shape),
-            decoder(hidden_dim + state_dim, observation_shape),
-            likelihood,
-            action_dim,
-            state_dim,
-            hidden_dim,
-            mlp_dim,
-            mlp_layers,
-            prior,
+            ModelParts(
+                belief=belief,
+                prior=prior,
+                encoder=encoder(observation_shape),
+                decoder=decoder(hidden_dim + state_dim, observation_shape),
+                likelihood=likelihood,
+                action_dim=action_dim,
+                state_dim=state_dim,
+                hidden_dim=hidden_dim,
+                mlp_dim=mlp_dim,
+                mlp_layers=mlp_layers,
+            )
         )
         require_path(kl, self.model)
         self.activation: Activation = activation
@@ -246,7 +248,7 @@ class WorldModel(SeededModule):
             "kl": (terms.kl * terms.mask).sum(1).mean(),
             **terms.auxiliary,
         }
-        values = {self.objective_name: terms.elbo.mean()} | {name: parts[name] for name in self.model.parts}
+        values = {self.objective_name: terms.elbo.mean()} | {name: parts[name] for name in self.model.logged_terms}
         return {name: value.detach() for name, value in values.items()}
 
 
