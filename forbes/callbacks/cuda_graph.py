@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.performance.fusion import fusing
-from forbes.training.world_model import WorldModel, together
+from forbes.training.world_model import LossTerm, WorldModel, sum_of_terms
 
 __all__ = ["CudaGraph", "Recording"]
 
@@ -53,20 +53,20 @@ class CudaGraph(Callback):
     ) -> None:
         """Record; the module seeds the noise of its update after this."""
         module = cast(WorldModel, pl_module)
-        if batch.mask.is_cuda and "losses" not in vars(module):
+        if batch.mask.is_cuda and module.recorded is None:
             with _float32_products("high" if self.tf32 else "highest"):
-                vars(module)["losses"] = Recording(module, batch, trainer.precision_plugin.forward_context)
+                module.recorded = Recording(module, batch, trainer.precision_plugin.forward_context)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Restore the losses of the module itself."""
-        vars(pl_module).pop("losses", None)
+        """Let the module compute its losses itself again."""
+        cast(WorldModel, pl_module).recorded = None
 
 
 class Recording:
-    """The losses of a module on a GPU, with their gradients, for batches of the same shapes.
+    """The loss of a module on a GPU, with its gradients, for batches of the same shapes.
 
-    All kernels are one graph. The objectives, which do not depend on each other, are branches of it, gradients
-    included: each alone is too small to fill the device.
+    All kernels are one graph. The terms of the loss, which do not depend on each other, are branches of it, with their
+    gradients: each alone is too small to fill the device.
 
     Args:
         module: in training mode; its parameters may change their values, not their memory.
@@ -85,7 +85,7 @@ class Recording:
             with fusing():
                 self._warm_up()
                 with torch.cuda.graph(self.graph):
-                    self.loss, self.values, self.gradients = self._compute()
+                    (self.loss, self.logs), self.gradients = self._compute()
         except RuntimeError as error:  # of CUDA, and of the compiler
             name, reason = type(module).__name__, str(error).strip().partition("\n")[0]
             raise ForbesError(
@@ -93,13 +93,13 @@ class Recording:
                 "the device, and needs triton and a C compiler. Leave CudaGraph out"
             ) from error
 
-    def __call__(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """See `WorldModel.losses`."""
+    def __call__(self, batch: SequenceBatch) -> LossTerm:
+        """See `WorldModel.total_loss`."""
         for ours, theirs in zip(self.batch, batch, strict=True):
             ours.copy_(theirs)
         self.graph.replay()
         loss: Tensor = _Played.apply(self.loss, self.gradients, *self.parameters)  # type: ignore[no-untyped-call]
-        return loss, {name: value.clone() for name, value in self.values.items()}
+        return LossTerm(loss, {name: value.clone() for name, value in self.logs.items()})
 
     def _warm_up(self) -> None:
         """Compute on another stream, as PyTorch asks for: the compiler and libraries make ready."""
@@ -110,25 +110,24 @@ class Recording:
                 self._compute()
         here.wait_stream(aside)
 
-    def _compute(self) -> tuple[Tensor, dict[str, Tensor], list[Tensor | None]]:
-        """Return the loss, what is logged of it, and each parameter's gradient, where it has one."""
+    def _compute(self) -> tuple[LossTerm, list[Tensor | None]]:
+        """Return the loss, and the gradient of each parameter that has one."""
         with self.precision():
-            objectives = self.module.objectives(self.batch)  # holds what branches share until all are done
+            loss_terms = self.module.loss_terms(self.batch)  # holds what they share until all are done
         here = torch.cuda.current_stream()
-        streams = [here, *_streams(len(objectives) - 1)]
+        streams = [here, *_streams(len(loss_terms) - 1)]
         for stream in streams[1:]:
             stream.wait_stream(here)
-        found, gradients_of = [], []
-        for objective, stream in zip(objectives, streams, strict=True):
+        terms, gradients_of = [], []
+        for compute, stream in zip(loss_terms, streams, strict=True):
             with torch.cuda.stream(stream):
                 with self.precision():
-                    loss, values = objective()
+                    loss, logs = compute()
                 gradients_of.append(torch.autograd.grad(loss, self.parameters, allow_unused=True))
-            found.append((loss.detach(), values))
+            terms.append(LossTerm(loss.detach(), logs))
         for stream in streams[1:]:
             here.wait_stream(stream)
-        loss, values = together(found)
-        return loss, values, [_sum(each) for each in zip(*gradients_of, strict=True)]
+        return sum_of_terms(terms), [_sum(gradients) for gradients in zip(*gradients_of, strict=True)]
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import MLP, Decoder, Encoder
 from forbes.shapes import printed_by_shape
 
-__all__ = ["BeliefModel", "EncodedSequence", "FrameLogProb", "ModelFamily", "Rollout", "State"]
+__all__ = ["BeliefModel", "EncodedSequence", "FrameLogProb", "ModelFamily", "ModelParts", "Rollout", "State"]
 
 
 @printed_by_shape
@@ -66,49 +66,85 @@ FrameLogProb: TypeAlias = Callable[[Tensor, Tensor], Tensor]
 `(*, N)`."""
 
 
+class ModelParts(NamedTuple):
+    """What a belief model is made of. `WorldModel` collects it from its arguments.
+
+    Example:
+        >>> parts = forbes.ModelParts(
+        ...     belief=forbes.GaussianBelief,
+        ...     encoder=forbes.MLPEncoder((3,)),
+        ...     decoder=forbes.MLPDecoder(20, (3,)),  # hidden_dim + state_dim inputs
+        ...     likelihood=forbes.VectorNormal(),
+        ...     action_dim=2,
+        ...     state_dim=4,
+        ...     hidden_dim=16,
+        ...     mlp_dim=16,
+        ...     mlp_layers=1,
+        ... )
+        >>> forbes.StateSpaceModel(parts).bound_name
+        'elbo[normal(1),S=1]'
+    """
+
+    belief: BeliefFamily
+    """Builds the head of the posterior, and that of the prior, from (state_dim, context_dim)."""
+    encoder: Encoder
+    """o_t to e_t."""
+    decoder: Decoder
+    """Features to the likelihood's parameters. Its input has `hidden_dim + state_dim` dimensions."""
+    likelihood: Likelihood
+    """What the decoder's output means."""
+    action_dim: int
+    """A, may be 0."""
+    state_dim: int
+    """D of s; 0 for a model without a stochastic state."""
+    hidden_dim: int
+    """H of h."""
+    mlp_dim: int
+    """Width of every MLP, and C of the belief's contexts."""
+    mlp_layers: int
+    """Layers of every MLP."""
+    prior: BeliefFamily | None = None
+    """Builds the head of the prior, where its family is another than `belief`."""
+
+
 class BeliefModel(Configurable, nn.Module, ABC):
     """A recurrent model that holds a belief: it filters, predicts, imagines and decodes.
 
-    To add one whose filter differs, copy `vector.py`: every abstract method below, and nothing else.
+    To add a model whose filter differs, copy `vector.py`. A subclass implements, in the order in which they are called:
+
+    - `bound_name`: the name of its training bound, by which the bound is logged.
+    - `lower_bound`: the bound on log p(o_1:T) of a batch, with its parts; training and validation.
+    - `initial`: (h_0, s_0), what the recurrence carries before the first observation.
+    - `sample_beliefs`: samples of the belief after the last observation; every forecast starts from them.
+    - `imagine`: a trajectory from such a sample, given actions and no observations.
+    - `predictive_log_prob`: an estimate of log p(o_t | o_1:t-1) of every step; scores.
+
+    It may override `num_belief_samples` and `logged_terms`. Everything else is shared.
 
     Args:
-        encoder: o_t to e_t.
-        decoder: features to the likelihood's parameters.
-        likelihood: what the decoder's output means.
-        input_dim: of (s, a), what moves the recurrence.
-        hidden_dim: H of h.
-        mlp_dim: width of the perceptron before the GRU.
-        mlp_layers: layers of it.
+        parts: what it is made of.
+        input_dim: dimensions of the input of the transition, before the GRU.
     """
 
-    parts: ClassVar[tuple[str, ...]] = ("reconstruction", "kl")
-    """What training logs beside the bound: parts of it, or names of `ElboTerms.auxiliary`."""
+    logged_terms: ClassVar[tuple[str, ...]] = ("reconstruction", "kl")
+    """What training logs in addition to the bound: its parts, or names of `ElboTerms.auxiliary`."""
     particles: int = 1
-    """How many of them one draw of the belief has."""
+    """Particles per sample of the belief."""
     center: Tensor | None
-    """The mean target, `(*O)`: encoder and decoder see what differs from it; None leaves both as they are."""
+    """The mean target, `(*O)`. Encoder and decoder then work on the difference to it; None leaves both as they are."""
 
-    def __init__(
-        self,
-        encoder: Encoder,
-        decoder: Decoder,
-        likelihood: Likelihood,
-        input_dim: int,
-        hidden_dim: int,
-        mlp_dim: int,
-        mlp_layers: int,
-    ) -> None:
+    def __init__(self, parts: ModelParts, input_dim: int) -> None:
         super().__init__()
-        self.hidden_dim = hidden_dim
-        self.encoder, self.decoder, self.likelihood = encoder, decoder, likelihood
-        self.transition = MLP(input_dim, mlp_dim, mlp_layers)
-        self.gru = nn.GRUCell(mlp_dim, hidden_dim)
+        self.hidden_dim = parts.hidden_dim
+        self.encoder, self.decoder, self.likelihood = parts.encoder, parts.decoder, parts.likelihood
+        self.transition = MLP(input_dim, parts.mlp_dim, parts.mlp_layers)
+        self.gru = nn.GRUCell(parts.mlp_dim, parts.hidden_dim)
         self.register_buffer("center", None)
 
     @property
     @abstractmethod
     def bound_name(self) -> str:
-        """Name the bound that `elbo` estimates, with its likelihood and its number of samples."""
+        """Name the bound that `lower_bound` estimates, with its likelihood and its number of samples."""
 
     @abstractmethod
     def initial(self, batch: int) -> State:
@@ -183,8 +219,5 @@ class BeliefModel(Configurable, nn.Module, ABC):
         return self.likelihood.log_prob(self.decode(features).float(), target)
 
 
-ModelFamily: TypeAlias = Callable[
-    [BeliefFamily, Encoder, Decoder, Likelihood, int, int, int, int, int, BeliefFamily | None], BeliefModel
-]
-"""Builds a model from (belief, encoder, decoder, likelihood, action_dim, state_dim, hidden_dim, mlp_dim, mlp_layers,
-prior): a class of this package with its other arguments bound."""
+ModelFamily: TypeAlias = Callable[[ModelParts], BeliefModel]
+"""Builds a model from its parts: a class of this package with its other arguments bound."""

@@ -20,12 +20,9 @@ from typing import Literal, NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from forbes.beliefs import BeliefFamily
-from forbes.errors import ForbesError
-from forbes.models.base import EncodedSequence, FrameLogProb, State
+from forbes.errors import ForbesError, require_at_least
+from forbes.models.base import EncodedSequence, FrameLogProb, ModelParts, State
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import Decoder, Encoder
 from forbes.models.state_space import Filtered, StateSpaceModel
 from forbes.performance.precision import full_precision
 from forbes.shapes import printed_by_shape
@@ -161,38 +158,25 @@ class ParticleModel(StateSpaceModel):
     size is below K / 2, since each draw costs variance. The gradient leaves out the choice of ancestors, as there.
 
     Args:
-        belief: and all others up to `prior`, as for `StateSpaceModel`.
-        particles: K.
-        resampling: "systematic"; or "soft", which lets gradients pass through the weights of those drawn anew.
+        parts: see `StateSpaceModel`.
+        particles: number of particles, K.
+        resampling: "systematic"; or "soft", which lets gradients pass through the weights of the resampled particles.
 
     Example:
-        >>> model = forbes.ParticleModel(
-        ...     forbes.GaussianBelief, forbes.MLPEncoder((3,)), forbes.MLPDecoder(20, (3,)),
-        ...     forbes.VectorNormal(), action_dim=2, state_dim=4, hidden_dim=16, mlp_dim=16, mlp_layers=1, particles=4)
+        >>> parts = forbes.ModelParts(
+        ...     belief=forbes.GaussianBelief, encoder=forbes.MLPEncoder((3,)), decoder=forbes.MLPDecoder(20, (3,)),
+        ...     likelihood=forbes.VectorNormal(), action_dim=2, state_dim=4, hidden_dim=16, mlp_dim=16, mlp_layers=1)
+        >>> model = forbes.ParticleModel(parts, particles=4)
         >>> terms = model.lower_bound(torch.zeros(5, 10, 3), torch.zeros(5, 10, 2), torch.ones(5, 10, dtype=torch.bool))
         >>> terms.elbo.shape
         torch.Size([5])
     """
 
     def __init__(
-        self,
-        belief: BeliefFamily,
-        encoder: Encoder,
-        decoder: Decoder,
-        likelihood: Likelihood,
-        action_dim: int,
-        state_dim: int,
-        hidden_dim: int,
-        mlp_dim: int,
-        mlp_layers: int,
-        prior: BeliefFamily | None = None,
-        particles: int = 8,
-        resampling: Literal["systematic", "soft"] = "systematic",
+        self, parts: ModelParts, particles: int = 8, resampling: Literal["systematic", "soft"] = "systematic"
     ) -> None:
-        sizes = (action_dim, state_dim, hidden_dim, mlp_dim, mlp_layers)
-        super().__init__(belief, encoder, decoder, likelihood, *sizes, prior)
-        if particles < 1:
-            raise ForbesError(f"ParticleModel: particles is {particles}, expected at least 1")
+        super().__init__(parts)
+        require_at_least(1, "ParticleModel", particles=particles)
         self.particles = particles
         self.resampling: Resampling = {"systematic": systematic, "soft": soft}[resampling]
 

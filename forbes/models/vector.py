@@ -15,12 +15,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from forbes.beliefs import BeliefFamily
-from forbes.errors import ForbesError
-from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, Rollout, State
+from forbes.errors import ForbesError, require_at_least
+from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import Decoder, Encoder, bind_gru
+from forbes.models.networks import bind_gru
 from forbes.performance.precision import full_precision
 from forbes.performance.time_loop import TimeLoop
 
@@ -31,54 +29,32 @@ class VectorModel(BeliefModel):
     """A deterministic recurrent model; the pair it carries is (h_t, e_t), what it believed and what it then saw.
 
     Args:
-        belief: not used, nor is `prior`: it has no density of a state.
-        encoder: o_t to e_t.
-        decoder: h to the likelihood's parameters; its input has `hidden_dim` dimensions.
-        likelihood: what the decoder's output means.
-        action_dim: A.
-        state_dim: 0, since it has no stochastic state.
-        hidden_dim: H of h.
-        mlp_dim: width of the perceptron before the GRU.
-        mlp_layers: layers of it.
-        prior: see `belief`.
-        overshoot: steps that are rolled on from one random step of each sequence in training.
+        parts: what it is made of; `state_dim` is 0, since it has no stochastic state, and the belief is not used. The
+            decoder's input has `hidden_dim` dimensions.
+        overshoot: steps that are imagined from one random step of each sequence in training.
 
     Raises:
-        ForbesError: where `state_dim` is not 0, or `overshoot` below 1.
+        ForbesError: when `state_dim` is not 0, or `overshoot` below 1.
 
     Example:
-        >>> model = forbes.VectorModel(
-        ...     forbes.GaussianBelief, forbes.MLPEncoder((3,)), forbes.MLPDecoder(16, (3,)),
-        ...     forbes.VectorNormal(), action_dim=2, state_dim=0, hidden_dim=16, mlp_dim=16, mlp_layers=1)
+        >>> parts = forbes.ModelParts(
+        ...     belief=forbes.GaussianBelief, encoder=forbes.MLPEncoder((3,)), decoder=forbes.MLPDecoder(16, (3,)),
+        ...     likelihood=forbes.VectorNormal(), action_dim=2, state_dim=0, hidden_dim=16, mlp_dim=16, mlp_layers=1)
+        >>> model = forbes.VectorModel(parts)
         >>> terms = model.lower_bound(torch.zeros(5, 10, 3), torch.zeros(5, 10, 2), torch.ones(5, 10, dtype=torch.bool))
         >>> terms.elbo.shape
         torch.Size([5])
     """
 
-    parts: ClassVar[tuple[str, ...]] = ("overshoot",)
+    logged_terms: ClassVar[tuple[str, ...]] = ("overshoot",)
 
-    def __init__(
-        self,
-        belief: BeliefFamily,
-        encoder: Encoder,
-        decoder: Decoder,
-        likelihood: Likelihood,
-        action_dim: int,
-        state_dim: int,
-        hidden_dim: int,
-        mlp_dim: int,
-        mlp_layers: int,
-        prior: BeliefFamily | None = None,
-        overshoot: int = 15,
-    ) -> None:
-        if state_dim != 0:
-            raise ForbesError(f"VectorModel: state_dim is {state_dim}, expected 0, it has no stochastic state")
-        if overshoot < 1:
-            raise ForbesError(f"VectorModel: overshoot is {overshoot}, expected at least 1")
-        input_dim = encoder.embedding_dim + action_dim
-        super().__init__(encoder, decoder, likelihood, input_dim, hidden_dim, mlp_dim, mlp_layers)
+    def __init__(self, parts: ModelParts, overshoot: int = 15) -> None:
+        if parts.state_dim != 0:
+            raise ForbesError(f"VectorModel: state_dim is {parts.state_dim}, expected 0, it has no stochastic state")
+        require_at_least(1, "VectorModel", overshoot=overshoot)
+        super().__init__(parts, parts.encoder.embedding_dim + parts.action_dim)
         self.overshoot = overshoot
-        self.nothing = nn.Parameter(torch.zeros(encoder.embedding_dim))
+        self.nothing = nn.Parameter(torch.zeros(parts.encoder.embedding_dim))
 
     @property
     def bound_name(self) -> str:

@@ -3,6 +3,7 @@
 import copy
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -14,10 +15,10 @@ from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.data.episodes.collection import episode_seed, play_whole
 from forbes.data.episodes.episode import Episode
 from forbes.envs import Environment
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.models import EncodedSequence, Filtered, StateSpaceModel
 from forbes.models.networks import activate
-from forbes.training.world_model import Objective, WorldModel, require_at_least
+from forbes.training.world_model import LossTerm, WorldModel
 
 __all__ = ["AgentPolicy", "WorldModelAgent", "play_measured"]
 
@@ -86,24 +87,22 @@ class WorldModelAgent(WorldModel, ABC):
     def action_selector(self, exploring: bool) -> ActionSelector:
         """Return how to act: with exploration, to learn from it, or as well as the agent can."""
 
-    def objectives(self, batch: SequenceBatch) -> list[Objective]:
-        """See `WorldModel.objectives`: that of the world model."""
+    def loss_terms(self, batch: SequenceBatch) -> list[Callable[[], LossTerm]]:
+        """See `WorldModel.loss_terms`: that of the world model."""
         encoded, filtered = self.follow(batch)
-        return [lambda: self.model_objective(filtered, encoded, batch)]
+        return [lambda: self.model_loss(filtered, encoded, batch)]
 
     def follow(self, batch: SequenceBatch) -> tuple[EncodedSequence, Filtered]:
         """Encode a batch, and draw a trajectory of the posterior along it."""
         encoded = self.model.encode(batch.observation, batch.action)
         return encoded, self.model.filter(encoded.embedding, encoded.action)
 
-    def model_objective(
-        self, filtered: Filtered, encoded: EncodedSequence, batch: SequenceBatch
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of model and reward in nats per step, and what is logged of it, along a trajectory."""
+    def model_loss(self, filtered: Filtered, encoded: EncodedSequence, batch: SequenceBatch) -> LossTerm:
+        """Return the loss of model and reward along a trajectory, in nats per step."""
         terms = self.model.bound(filtered, encoded, batch.mask, self.kl)
         means = {name: terms.mean_over_steps(values) for name, values in self.log_probs(filtered, batch).items()}
         loss = self.loss(terms) - sum(means.values())
-        return loss, self.measures(terms) | {name: mean.detach() for name, mean in means.items()}
+        return LossTerm(loss, self.measures(terms) | {name: mean.detach() for name, mean in means.items()})
 
     def log_probs(self, filtered: Filtered, batch: SequenceBatch) -> dict[str, Tensor]:
         """Return what the model learns besides observations, by name: log p(r_t | f_t) in nats, `(B, T)`."""
@@ -120,8 +119,10 @@ class AgentPolicy:
 
     @classmethod
     def as_it_is(cls, agent: WorldModelAgent, exploring: bool) -> Self:
-        """Take a copy, on the CPU, that does not learn any further."""
-        return cls(copy.deepcopy(agent).cpu().eval(), exploring)
+        """Copy an agent to the CPU, in eval mode, and without its `recorded` update, which belongs to one process."""
+        shallow = copy.copy(agent)
+        shallow.recorded = None
+        return cls(copy.deepcopy(shallow).cpu().eval(), exploring)
 
     def __call__(self, environment: Environment, seed: int) -> Agent:
         """See `MakePolicy`."""

@@ -4,9 +4,8 @@ from typing import Any
 
 from forbes.control.agent import ActionSelector, follow_plan, noisy
 from forbes.control.planning import CrossEntropy
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.training.acting import WorldModelAgent
-from forbes.training.world_model import require_at_least
 
 __all__ = ["PlanningAgent"]
 

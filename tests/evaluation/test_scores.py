@@ -11,7 +11,7 @@ from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.evaluation.scores import frame_log_prob, score_particles, trajectories
 from forbes.evaluation.scoring import make_scorer, score_split
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, Normal, ParticleModel, StateSpaceModel
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ModelParts, Normal, ParticleModel, StateSpaceModel
 from forbes.seeding import derive_seed
 
 SHAPE, STEPS = (1, 4, 4), 5
@@ -34,9 +34,18 @@ class Certain(BeliefHead):
 
 def make_model(belief=Certain, likelihood=None, actions=2, build=StateSpaceModel):
     torch.manual_seed(0)
-    encoder, decoder = MLPEncoder(SHAPE, 6, 1), MLPDecoder(4 + 3, SHAPE, 6, 1)
-    model = build(belief, encoder, decoder, likelihood or Bernoulli(), actions, 3, 4, 8, 2)
-    return model.double().eval()
+    parts = ModelParts(
+        belief=belief,
+        encoder=MLPEncoder(SHAPE, 6, 1),
+        decoder=MLPDecoder(4 + 3, SHAPE, 6, 1),
+        likelihood=likelihood or Bernoulli(),
+        action_dim=actions,
+        state_dim=3,
+        hidden_dim=4,
+        mlp_dim=8,
+        mlp_layers=2,
+    )
+    return build(parts).double().eval()
 
 
 def make_batch(sequences=7, actions=2):

@@ -2,7 +2,19 @@
 
 import pytest
 import torch
-from small_models import ACTION, BATCH, HIDDEN, MODELS, SHAPE, TIME, make_model, random_model, random_state, sequences
+from small_models import (
+    ACTION,
+    BATCH,
+    HIDDEN,
+    MODELS,
+    PARTS,
+    SHAPE,
+    TIME,
+    make_model,
+    random_model,
+    random_state,
+    sequences,
+)
 
 from forbes.models import EncodedSequence, State, elbo_loss
 
@@ -93,7 +105,7 @@ def test_beliefs_of_a_model_with_a_state_differ(kind):
 
     belief = torch.cat(seeded(model.sample_beliefs, model.encode(observation, action), 3 * model.particles), -1)
 
-    if MODELS[kind].keywords.get("state_dim") == 0:
+    if PARTS[kind].get("state_dim") == 0:
         assert len(belief.unique(dim=0)) == BATCH
     else:
         assert len(belief.unique(dim=0)) > 2 * BATCH

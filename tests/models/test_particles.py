@@ -10,7 +10,7 @@ from small_models import random_model, sequences
 
 from forbes.beliefs import GaussianBelief
 from forbes.errors import ForbesError
-from forbes.models import ParticleModel, StateSpaceModel
+from forbes.models import ModelParts, ParticleModel, StateSpaceModel
 from forbes.models.particles import effective_sample_size, run_particles, soft, systematic, systematic_resampling
 
 ROUNDING = 1e-4  # of float32, in nats or units of the state
@@ -71,9 +71,8 @@ def assert_mean_is(values, expected):
 def test_one_particle_is_the_state_space_model(resampling):
     plain, batch = random_model("gaussian"), sequences()
     like = {name: getattr(plain, name) for name in ("encoder", "decoder", "likelihood", "state_dim", "hidden_dim")}
-    one = ParticleModel(
-        GaussianBelief, **like, action_dim=2, mlp_dim=9, mlp_layers=2, particles=1, resampling=resampling
-    ).double()
+    parts = ModelParts(GaussianBelief, **like, action_dim=2, mlp_dim=9, mlp_layers=2)
+    one = ParticleModel(parts, particles=1, resampling=resampling).double()
     one.load_state_dict(plain.state_dict())
 
     terms, expected = one.lower_bound(*batch), plain.lower_bound(*batch)

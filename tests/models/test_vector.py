@@ -10,7 +10,7 @@ from forbes.beliefs import GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.evaluation.scores import score_predictions
-from forbes.models import MLPDecoder, MLPEncoder, OneHot, VectorModel, elbo_loss
+from forbes.models import MLPDecoder, MLPEncoder, ModelParts, OneHot, VectorModel, elbo_loss
 
 
 @pytest.fixture
@@ -22,7 +22,8 @@ def make_vector_model(state_dim=0, overshoot=2):
     """Of sequences of three symbols."""
     torch.manual_seed(0)
     encoder, decoder = MLPEncoder((3,), 5, 1), MLPDecoder(6, (3,), 5, 1)
-    return VectorModel(GaussianBelief, encoder, decoder, OneHot(), 0, state_dim, 6, 7, 1, overshoot=overshoot)
+    sizes = {"action_dim": 0, "state_dim": state_dim, "hidden_dim": 6, "mlp_dim": 7, "mlp_layers": 1}
+    return VectorModel(ModelParts(GaussianBelief, encoder, decoder, OneHot(), **sizes), overshoot)
 
 
 def chain_rule(model, observation, action):
