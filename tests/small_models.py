@@ -48,13 +48,6 @@ PARTS = {
 }
 
 
-class Bernoulli64(Bernoulli):
-    """Pixels for a model in float64."""
-
-    def target(self, observation):
-        return observation.double()
-
-
 def make_model(kind, action_dim=ACTION, width=9, seed=0):
     changes = PARTS[kind]
     torch.manual_seed(seed)
@@ -62,7 +55,7 @@ def make_model(kind, action_dim=ACTION, width=9, seed=0):
         belief=GaussianBelief,
         encoder=MLPEncoder(SHAPE, width, layers=1),
         decoder=MLPDecoder(HIDDEN + changes.get("state_dim", STATE), SHAPE, width, layers=1),
-        likelihood=Bernoulli64(),
+        likelihood=Bernoulli(),
         action_dim=action_dim,
         state_dim=STATE,
         hidden_dim=HIDDEN,

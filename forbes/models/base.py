@@ -194,18 +194,21 @@ class BeliefModel(Configurable, nn.Module, ABC):
 
     def encode(self, observation: Tensor, action: Tensor) -> EncodedSequence:
         """Read stored observations `(B, T, *O)` and the actions that led to them `(B, T, A)`."""
-        target = self.likelihood.target(observation)
+        target = self._target(observation)
         return EncodedSequence(target, self.embed_target(target), action)
 
     def embed(self, observation: Tensor) -> Tensor:
         """Encode every frame: stored observations `(B, T, *O)` to e `(B, T, E)`."""
-        return self.embed_target(self.likelihood.target(observation))
+        return self.embed_target(self._target(observation))
 
     def embed_target(self, target: Tensor) -> Tensor:
         """Encode every frame as `Likelihood.target` or `Likelihood.sample` gives it: `(B, T, *O)` to e `(B, T, E)`."""
         shown = target if self.center is None else target - self.center
         embedding: Tensor = self.encoder(shown.flatten(0, 1)).to(target.dtype)  # (B T, E)
         return embedding.view(*target.shape[:2], -1)  # (B, T, E)
+
+    def _target(self, observation: Tensor) -> Tensor:
+        return self.likelihood.target(observation).to(self.gru.weight_hh.dtype)
 
     def decode(self, features: Tensor) -> Tensor:
         """Return the likelihood's parameters: features `(*, F)` to `(*, *O)`."""
@@ -216,7 +219,9 @@ class BeliefModel(Configurable, nn.Module, ABC):
 
     def log_likelihood(self, features: Tensor, target: Tensor) -> Tensor:
         """Return log p(o | features) in nats: `(*, F)` and `(*, *O)`, which broadcast, to `(*)`."""
-        return self.likelihood.log_prob(self.decode(features).float(), target)
+        output = self.decode(features)
+        precise = torch.promote_types(output.dtype, torch.float32)  # in mixed precision the decoder's is bfloat16
+        return self.likelihood.log_prob(output.to(precise), target)
 
 
 ModelFamily: TypeAlias = Callable[[ModelParts], BeliefModel]

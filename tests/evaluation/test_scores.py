@@ -66,14 +66,6 @@ def in_batches(batch, size):
     return [(start, SequenceBatch(*(values[start : start + size] for values in batch))) for start in starts]
 
 
-@pytest.fixture(autouse=True)
-def float64(monkeypatch):
-    """Observations become float64 too, so that a tolerance says something about the formula."""
-    monkeypatch.setattr(Bernoulli, "target", lambda self, observation: observation.double())
-    monkeypatch.setattr(Normal, "target", lambda self, observation: observation.double() / self.scale - 0.5)
-    monkeypatch.setattr(torch.Tensor, "float", torch.Tensor.double)
-
-
 def elbo(model, batches, samples, **options):
     """The pass that `forbes evaluate` makes; its scores summed over the steps, (N,)."""
     scores = score_split(model, batches, make_scorer("elbo", samples, 1, 1), **options)
@@ -86,7 +78,7 @@ def plain_elbo(model, observation, action, steps):
     total = 0.0
     for t in range(steps):
         hidden = model.gru(model.transition(torch.cat((state, action[t : t + 1]), -1)), hidden)
-        target = model.likelihood.target(observation[t : t + 1])
+        target = model.likelihood.target(observation[t : t + 1]).double()
         context = model.posterior_context(torch.cat((hidden, model.encoder(target)), -1))
         state, log_posterior = model.posterior.rsample(context)
         log_prior = model.prior.log_prob(state, model.prior_context(hidden))
@@ -122,7 +114,7 @@ def plain_future(model, observation, action, context):
     found = []
     for t, frame in enumerate(observation):
         hidden = model.gru(model.transition(torch.cat((state, action[t : t + 1]), -1)), hidden)
-        target = model.likelihood.target(frame[None])
+        target = model.likelihood.target(frame[None]).double()
         seen = model.posterior_context(torch.cat((hidden, model.encoder(target)), -1))
         unseen = model.prior_context(hidden)
         state, _ = model.posterior.rsample(seen) if t < context else model.prior.rsample(unseen)

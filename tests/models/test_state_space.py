@@ -32,7 +32,7 @@ def step_by_step(model, observation, action, kl="monte_carlo"):
     hidden, state = model.initial(len(observation))
     reconstruction, divergence = [], []
     for t in range(observation.shape[1]):
-        target = model.likelihood.target(observation[:, t])
+        target = model.likelihood.target(observation[:, t]).double()
         hidden = model.gru(model.transition(torch.cat((state, action[:, t]), -1)), hidden)
         context = model.posterior_context(torch.cat((hidden, model.encoder(target)), -1))
         state, log_posterior = model.posterior.rsample(context)

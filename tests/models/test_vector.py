@@ -32,7 +32,7 @@ def chain_rule(model, observation, action):
     each = []
     for t in range(observation.shape[1]):
         hidden = model.gru(model.transition(torch.cat((before, action[:, t]), -1)), hidden)
-        target = model.likelihood.target(observation[:, t])
+        target = model.likelihood.target(observation[:, t]).double()
         each.append(model.likelihood.log_prob(model.decoder(hidden), target))
         before = model.encoder(target)
     return torch.stack(each, 1)
@@ -43,7 +43,7 @@ def rolled_on(model, observation, action, start, steps):
     hidden, before = model.initial(1)
     for t in range(start + 1):
         hidden = model.gru(model.transition(torch.cat((before, action[None, t]), -1)), hidden)
-        before = model.encoder(model.likelihood.target(observation[None, t]))
+        before = model.encoder(model.likelihood.target(observation[None, t]).double())
     total = torch.zeros((), dtype=torch.float64)
     for t in range(start + 1, start + 1 + steps):
         hidden = model.gru(model.transition(torch.cat((model.nothing[None], action[None, t]), -1)), hidden)
