@@ -1,7 +1,6 @@
 """What agents have in common: a world model that knows rewards too, and a choice of actions."""
 
 import copy
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from forbes.control.policy import ScalarHead
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.data.episodes.collection import episode_seed, play_whole
 from forbes.data.episodes.episode import Episode
+from forbes.densities import log_normal
 from forbes.envs import Environment
 from forbes.errors import ForbesError, require_at_least
 from forbes.models import EncodedSequence, Filtered, StateSpaceModel
@@ -106,8 +106,7 @@ class WorldModelAgent(WorldModel, ABC):
 
     def log_probs(self, filtered: Filtered, batch: SequenceBatch) -> dict[str, Tensor]:
         """Return what the model learns besides observations, by name: log p(r_t | f_t) in nats, `(B, T)`."""
-        error: Tensor = (self.reward(filtered.features) - batch.reward) / self.reward_std  # (B, T)
-        return {"reward": -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))}
+        return {"reward": log_normal(batch.reward, self.reward(filtered.features), self.reward_std)}
 
 
 @dataclass(frozen=True)
