@@ -1,6 +1,6 @@
 """State-space models as pure modules: they compute and return records, and never log."""
 
-from forbes.models.base import BeliefModel, EncodedSequence, ModelFamily, ModelParts, Prediction, Rollout, State
+from forbes.models.base import BeliefModel, EncodedSequence, ModelFamily, ModelParts, Rollout, State
 from forbes.models.elbo import ElboTerms, elbo_loss
 from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, OnePixel, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
@@ -28,7 +28,6 @@ __all__ = [
     "ParticleModel",
     "PixelDecoder",
     "PixelEncoder",
-    "Prediction",
     "Rollout",
     "State",
     "StateSpaceModel",

@@ -19,7 +19,7 @@ from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import MLP, Decoder, Encoder
 from forbes.shapes import printed_by_shape
 
-__all__ = ["BeliefModel", "EncodedSequence", "ModelFamily", "ModelParts", "Prediction", "Rollout", "State"]
+__all__ = ["BeliefModel", "EncodedSequence", "FrameLogProb", "ModelFamily", "ModelParts", "Rollout", "State"]
 
 
 @printed_by_shape
@@ -61,14 +61,9 @@ class EncodedSequence(NamedTuple):
     """a_{t-1}, `(B, T, A)`."""
 
 
-@printed_by_shape
-class Prediction(NamedTuple):
-    r"""The predictive distribution of every observation: :math:`p(o_t \mid o_{<t}) = \sum_k W^k p(o_t \mid x^k)`."""
-
-    features: Tensor
-    """x of K particles, `(K, B, T, F)`; those of step t depend on o_1, …, o_{t-1} only."""
-    log_weight: Tensor
-    """log W, normalised over the particles, `(K, B, T)`."""
+FrameLogProb: TypeAlias = Callable[[Tensor, Tensor], Tensor]
+"""log p(o | features) in nats: features `(*, N, F)` and N targets `(N, *O)`, each scored under every leading index, to
+`(*, N)`."""
 
 
 class ModelParts(NamedTuple):
@@ -122,7 +117,7 @@ class BeliefModel(Configurable, nn.Module, ABC):
     - `initial`: (h_0, s_0), what the recurrence carries before the first observation.
     - `sample_beliefs`: samples of the belief after the last observation; every forecast starts from them.
     - `imagine`: a trajectory from such a sample, given actions and no observations.
-    - `predict_one_step`: the predictive distribution of every o_t given o_1:t-1; scores.
+    - `predictive_log_prob`: an estimate of log p(o_t | o_1:t-1) of every step; scores.
 
     It may override `num_belief_samples` and `logged_terms`. Everything else is shared.
 
@@ -171,8 +166,15 @@ class BeliefModel(Configurable, nn.Module, ABC):
         """Sample (h, s) after the last step given all observations, N times each: `(N B, ...)`, sample-major."""
 
     @abstractmethod
-    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
-        """Predict every o_t from one sample of the belief after t - 1 steps, which has `particles` particles."""
+    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
+        """Estimate log p(o_t | o_<t) of every step from one sample of the belief after t - 1 steps, in nats, `(B, T)`.
+
+        The exponential is unbiased, so that of several samples it is averaged. Step t depends on nothing after o_t.
+
+        Args:
+            encoded: B sequences of T steps.
+            log_likelihood: how frames are scored; evaluation has its own, in float64.
+        """
 
     @abstractmethod
     def imagine(self, start: State, action: Tensor) -> Rollout:

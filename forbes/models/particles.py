@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 
 from forbes.errors import ForbesError, require_at_least
-from forbes.models.base import EncodedSequence, ModelParts, Prediction, State
+from forbes.models.base import EncodedSequence, FrameLogProb, ModelParts, State
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.state_space import StateSpaceModel
+from forbes.models.state_space import Filtered, StateSpaceModel
 from forbes.performance.precision import full_precision
 from forbes.shapes import printed_by_shape
 
@@ -53,6 +53,8 @@ class Particles(NamedTuple):
     """log p(o_t | h_t, s_t) in nats, `(K, B)`."""
     increment: Tensor
     """What the step adds to the bound, log p̂_t in nats, `(B,)`."""
+    filtered: Filtered
+    """The same particles with context and density, `(K B, ...)`."""
 
 
 def effective_sample_size(log_weight: Tensor) -> Tensor:
@@ -135,7 +137,7 @@ def run_particles(
         increment = joint.logsumexp(0)  # (B,)
         log_weight = joint - increment
         hidden, state = (values.view(*stay.shape, -1) for values in (moved.hidden, moved.state))  # (K, B, ...)
-        yield Particles(hidden, state, log_before, log_weight, reconstruction, increment)
+        yield Particles(hidden, state, log_before, log_weight, reconstruction, increment, moved)
         again = effective_sample_size(log_weight) < number / 2  # (B,)
         ancestor, log_child = resampling(log_weight)
         carried = _choose(hidden, state, torch.where(again, ancestor, stay))
@@ -201,14 +203,18 @@ class ParticleModel(StateSpaceModel):
         uniform = torch.rand_like(last.log_weight[0])  # (B,)
         return _choose(last.hidden, last.state, systematic_resampling(last.log_weight, uniform, samples))
 
-    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
-        """See `BeliefModel.predict_one_step`: each particle draws s_t from the prior."""
-        features, log_weight = [], []
-        for step in self._run(encoded):
-            state, _ = self.prior.rsample(self.prior_context(step.hidden))  # (K, B, D)
-            features.append(torch.cat((step.hidden, state), -1))  # (K, B, H + D)
-            log_weight.append(step.log_before.log_softmax(0))
-        return Prediction(torch.stack(features, 2), torch.stack(log_weight, 2))  # (K, B, T, H + D), (K, B, T)
+    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
+        """See `BeliefModel.predictive_log_prob`: the weighted mean over one set of particles."""
+
+        def step_log_prob(step: Particles, target: Tensor) -> Tensor:
+            def score(features: Tensor) -> Tensor:
+                return log_likelihood(features.view(*step.log_before.shape, -1), target).flatten()  # (K B,)
+
+            each = self.one_step_log_prob(step.filtered, score(step.filtered.features), score)  # (K B,)
+            return (step.log_before.log_softmax(0) + each.view(step.log_before.shape)).logsumexp(0)  # (B,)
+
+        steps = zip(self._run(encoded), encoded.target.unbind(1), strict=True)
+        return torch.stack([step_log_prob(step, target) for step, target in steps], 1)  # (B, T)
 
     def num_belief_samples(self, number: int) -> int:
         """See `BeliefModel.num_belief_samples`: a draw is a whole set."""

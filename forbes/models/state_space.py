@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import linear
+from torch.nn.functional import linear, softplus
 
 from forbes.beliefs import BeliefHead
 from forbes.errors import require_at_least
-from forbes.models.base import BeliefModel, EncodedSequence, ModelParts, Prediction, Rollout, State
+from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.networks import MLP, bind_gru
 from forbes.performance.precision import full_precision
@@ -186,15 +186,47 @@ class StateSpaceModel(BeliefModel):
             -1
         )  # (N B, ...)
 
-    def predict(self, filtered: Filtered) -> Tensor:
-        """Return [h_t, s_t] with s_t drawn from the prior, which has not seen o_t, `(B, T, H + D)`."""
-        state, _ = self.prior.rsample(self.prior_context(filtered.hidden))  # (B, T, D)
-        return torch.cat((filtered.hidden, state), -1)  # (B, T, H + D)
+    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
+        """See `BeliefModel.predictive_log_prob`: along one posterior trajectory."""
+        filtered = self.filter(encoded.embedding, encoded.action)
 
-    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
-        """See `BeliefModel.predict_one_step`: along one posterior trajectory."""
-        features = self.predict(self.filter(encoded.embedding, encoded.action))
-        return Prediction(features[None], features.new_zeros(1, *features.shape[:2]))  # (1, B, T, H + D), (1, B, T)
+        def score(features: Tensor) -> Tensor:
+            return log_likelihood(features.flatten(0, 1), encoded.target.flatten(0, 1)).view(
+                features.shape[:2]
+            )  # (B, T)
+
+        return self.one_step_log_prob(filtered, score(filtered.features), score)
+
+    def one_step_log_prob(
+        self, filtered: Filtered, reconstruction: Tensor, log_likelihood: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        r"""Estimate log p(o_t | h_t), in nats, from a sample of the prior and the posterior's.
+
+        .. math:: \hat p(o_t \mid h_t) = \sum_{s \in \{\tilde s_t,\, s_t\}} p(o_t \mid h_t, s)\,
+                  \frac{p(s \mid h_t)}{p(s \mid h_t) + q(s \mid h_t, e_t)}, \qquad
+                  \tilde s_t \sim p(\cdot \mid h_t), \quad s_t \sim q(\cdot \mid h_t, e_t)
+
+        This is multiple importance sampling with the balance heuristic (Veach and Guibas, 1995): unbiased for every
+        posterior. The prior rarely finds an o_t that leaves few states possible. The posterior finds them, and no
+        weight can exceed 1, however narrow it is.
+
+        Args:
+            filtered: from `filter`, any leading shape `(*)`.
+            reconstruction: log p(o_t | h_t, s_t), `(*)`.
+            log_likelihood: log p(o_t | features) of features `(*, H + D)`, to `(*)`.
+
+        Returns:
+            `(*)`, in the dtype of `reconstruction`.
+        """
+        with full_precision(filtered.state):
+            context = self.prior_context(filtered.hidden)
+            sample, log_prior = self.prior.rsample(context)  # (*, D), (*)
+            log_posterior = self.posterior.log_prob(sample, filtered.context)
+            log_prior_at_posterior = self.prior.log_prob(filtered.state, context)
+        prediction = log_likelihood(torch.cat((filtered.hidden, sample), -1))
+        by_prior = prediction + _log_share(log_prior, log_posterior)
+        by_posterior = reconstruction + _log_share(log_prior_at_posterior, filtered.log_prob)
+        return torch.logaddexp(by_prior, by_posterior)
 
     def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """See `BeliefModel.lower_bound`: with one posterior trajectory per sequence."""
@@ -236,3 +268,8 @@ class StateSpaceModel(BeliefModel):
             return x
 
         return run
+
+
+def _log_share(log_p: Tensor, log_q: Tensor) -> Tensor:
+    """Return log p / (p + q)."""
+    return -softplus(log_q - log_p)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from forbes.errors import ForbesError, require_at_least
-from forbes.models.base import BeliefModel, EncodedSequence, ModelParts, Prediction, Rollout, State
+from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.networks import bind_gru
 from forbes.performance.precision import full_precision
@@ -91,10 +91,10 @@ class VectorModel(BeliefModel):
         hidden = self.filter(encoded.embedding, encoded.action)
         return State(hidden[:, -1].repeat(samples, 1), encoded.embedding[:, -1].repeat(samples, 1))  # (N B, ...)
 
-    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
-        """See `BeliefModel.predict_one_step`."""
+    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
+        """See `BeliefModel.predictive_log_prob`: it is exact."""
         hidden = self.filter(encoded.embedding, encoded.action)
-        return Prediction(hidden[None], hidden.new_zeros(1, *hidden.shape[:2]))  # (1, B, T, H), (1, B, T)
+        return log_likelihood(hidden.flatten(0, 1), encoded.target.flatten(0, 1)).view(hidden.shape[:2])  # (B, T)
 
     def num_belief_samples(self, number: int) -> int:
         """See `BeliefModel.num_belief_samples`: one is as good as many."""

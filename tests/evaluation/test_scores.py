@@ -9,7 +9,7 @@ from torch import nn
 from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.evaluation.scores import frame_log_prob, score_particles, score_predictions, trajectories
+from forbes.evaluation.scores import frame_log_prob, score_particles, trajectories
 from forbes.evaluation.scoring import make_scorer, score_split
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ModelParts, Normal, ParticleModel, StateSpaceModel
 from forbes.seeding import derive_seed
@@ -197,22 +197,6 @@ def test_the_fivo_bound_is_the_one_that_particles_are_trained_by():
 
     torch.testing.assert_close(scores["fivo"].sum(1), terms.elbo)
     assert (scores["ess"][batch.mask] < 0.5).any()
-
-
-def test_a_prediction_of_weighted_particles_is_their_weighted_mean():
-    model, batch = make_model(GaussianBelief, build=partial(ParticleModel, particles=5)), make_batch()
-    torch.manual_seed(3)
-    scores = score_predictions(model, batch, 10)  # two sets
-
-    torch.manual_seed(3)
-    seen = model.encode(batch.observation, batch.action)
-    likelihood = 0
-    with torch.no_grad():
-        for features, log_weight in (model.predict_one_step(seen) for _ in range(2)):
-            log_prob = torch.stack([model.log_likelihood(some, seen.target) for some in features])  # (K, B, T)
-            likelihood += (log_weight.exp() * log_prob.exp()).sum(0) / 2
-    torch.testing.assert_close(scores["pll"], likelihood.log() * batch.mask)
-    assert (log_weight.std(0)[:, 1:] > 0.01).any()
 
 
 def test_the_reported_value_is_the_mean_over_samples_and_depends_on_the_seed_alone():

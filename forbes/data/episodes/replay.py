@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forbes.data.episodes.store import EpisodeStore, first_held
 from forbes.data.episodes.episode import EpisodeRecord
+from forbes.data.episodes.store import EpisodeStore, first_held
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError, require_at_least
 from forbes.seeding import generator
