@@ -24,19 +24,18 @@ class ForbesError(Exception):
         >>> forbes.Strokes(points_per_step=0)
         Traceback (most recent call last):
         ...
-        forbes.errors.ForbesError: Strokes: points_per_step is 0, expected at least 1.
+        forbes.errors.ForbesError: Strokes: points_per_step is 0, expected at least 1
     """
 
     exit_status = 2
 
 
-def require_at_least(least: float, where: str, *, remedy: str = "", **numbers: Any) -> None:
+def require_at_least(least: float, where: str, **numbers: Any) -> None:
     """Raise a ForbesError for the first number that is below a minimum, or is no number.
 
     Args:
         least: the minimum.
         where: the name that the sentence begins with, e.g. that of the class.
-        remedy: what to do, a sentence of its own.
         **numbers: arguments by name; a configuration can set them to null.
 
     Example:
@@ -47,7 +46,7 @@ def require_at_least(least: float, where: str, *, remedy: str = "", **numbers: A
     """
     for name, number in numbers.items():
         if number is None or not number >= least:
-            raise ForbesError(f"{where}: {name} is {number}, expected at least {least}" + (remedy and f". {remedy}"))
+            raise ForbesError(f"{where}: {name} is {number}, expected at least {least}")
 
 
 def unwritable(path: Path | str, error: OSError) -> ForbesError:

@@ -1,8 +1,8 @@
-r"""What training, evaluation and figures ask of a model, whatever its filter.
+r"""The interface of a belief model, which training, evaluation and figures use.
 
 .. math:: h_t = \mathrm{GRU}(h_{t-1}, \mathrm{MLP}(s_{t-1}, a_{t-1})), \qquad p(o_t \mid \text{features}_t)
 
-Every model carries a pair (h, s) along a sequence; what s is, and how it learns of o_t, is the model's own.
+Every model carries a pair (h, s) along a sequence. Models differ in what s is, and in how it is inferred from o_t.
 """
 
 from abc import ABC, abstractmethod
@@ -24,7 +24,7 @@ __all__ = ["BeliefModel", "EncodedSequence", "FrameLogProb", "ModelFamily", "Mod
 
 @printed_by_shape
 class State(NamedTuple):
-    """What the recurrence carries."""
+    """The state of the recurrence."""
 
     hidden: Tensor
     """h, `(*, H)`."""
@@ -39,7 +39,7 @@ class Rollout(NamedTuple):
     hidden: Tensor
     """h_t, `(B, T, H)`."""
     state: Tensor
-    """s_t, drawn from the prior, `(B, T, D)`."""
+    """s_t, sampled from the prior, `(B, T, D)`."""
     log_prob: Tensor
     """log p(s_t | h_t) in nats, `(B, T)`."""
 
@@ -51,7 +51,7 @@ class Rollout(NamedTuple):
 
 @printed_by_shape
 class EncodedSequence(NamedTuple):
-    """What a filter reads, encoded once for all the times it is read."""
+    """The input of a filter, encoded once for several runs of it."""
 
     target: Tensor
     """o_t as `Likelihood.target` or `Likelihood.sample` gives it, `(B, T, *O)`."""
@@ -148,22 +148,22 @@ class BeliefModel(Configurable, nn.Module, ABC):
 
     @abstractmethod
     def initial(self, batch: int) -> State:
-        """Return (h_0, s_0), `(B, ...)`: what is carried before anything was seen."""
+        """Return (h_0, s_0), `(B, ...)`: the state before the first observation."""
 
     @abstractmethod
     def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
-        """Estimate the lower bound of log p(o_1:T) that the model is trained by.
+        """Estimate the lower bound on log p(o_1:T) that trains the model.
 
         Args:
-            observation: as in `SequenceBatch`, like the next two.
-            action: a_{t-1}.
-            mask: True where the step counts.
+            observation: o_t as stored, `(B, T, *O)`.
+            action: a_{t-1}, `(B, T, A)`.
+            mask: True where the step is no padding, `(B, T)`.
             kl: how the KL is differentiated, where the model has one.
         """
 
     @abstractmethod
     def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
-        """Draw N of the belief over (h, s) after the last step, given all that was seen: `(N B, ...)`, sample-major."""
+        """Sample (h, s) after the last step given all observations, N times each: `(N B, ...)`, sample-major."""
 
     @abstractmethod
     def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
@@ -178,22 +178,22 @@ class BeliefModel(Configurable, nn.Module, ABC):
 
     @abstractmethod
     def imagine(self, start: State, action: Tensor) -> Rollout:
-        """Roll on from `start` without observations, each row on its own trajectory.
+        """Continue from `start` without observations, each row on its own trajectory.
 
         Args:
-            start: (h, s), `(B, ...)`; `beliefs` gives several per history.
-            action: a of each step, the one that leads to it, `(B, T, A)`.
+            start: (h, s), `(B, ...)`, e.g. from `sample_beliefs`.
+            action: the action that leads to each step, `(B, T, A)`.
 
         Returns:
-            T steps after `start`, which itself is not among them.
+            T steps after `start`, without `start` itself.
         """
 
     def num_belief_samples(self, number: int) -> int:
-        """Return how many independent draws of the belief make so many particles."""
+        """Return how many independent samples of the belief have `number` particles together."""
         return number
 
     def encode(self, observation: Tensor, action: Tensor) -> EncodedSequence:
-        """Read stored observations `(B, T, *O)` and the actions that led to them `(B, T, A)`."""
+        """Encode stored observations `(B, T, *O)` and the actions that led to them `(B, T, A)`."""
         target = self._target(observation)
         return EncodedSequence(target, self.embed_target(target), action)
 

@@ -1,4 +1,4 @@
-r"""The recurrent state-space model: filter a sequence, imagine its future, decode both (DESIGN §5, paper §3.1).
+r"""The recurrent state-space model: filter a sequence, imagine its future, decode both (paper §3.1).
 
 .. math::
 

@@ -5,9 +5,9 @@ r"""A belief without a distribution: h_t itself, which predicts the next observa
     h_t = \mathrm{GRU}(h_{t-1}, \mathrm{MLP}(e_{t-1}, a_{t-1})), \quad (h_0, e_0) = (0, \bar e), \qquad
     \log p(o_{1:T}) = \sum_t \log p(o_t \mid h_t)
 
-Nothing is drawn, so the likelihood is exact, by the chain rule, and no bound is needed. Rolled on without observations,
-the learned embedding :math:`\bar e` of "nothing seen" stands for those that are missing: the simulator of Gregor et
-al., 2019, arXiv 1906.09237. One-step predictions alone would never train it, so it is trained by overshooting.
+Nothing is sampled, so the likelihood is exact, by the chain rule, and no bound is needed. In imagination, the learned
+embedding :math:`\bar e` of "nothing seen" replaces missing observations: the simulator of Gregor et al., 2019,
+arXiv 1906.09237. One-step predictions alone would never train it, so it is trained by overshooting.
 """
 
 from typing import ClassVar
@@ -101,7 +101,7 @@ class VectorModel(BeliefModel):
         return 1
 
     def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
-        """Return log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the roll-out beside them."""
+        """Return log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the overshooting."""
         encoded = self.encode(observation, action)
         hidden = self.filter(encoded.embedding, action)
         log_likelihood = self.log_likelihood(hidden, encoded.target)  # (B, T)

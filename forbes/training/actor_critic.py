@@ -24,7 +24,8 @@ __all__ = ["ImaginationActorCritic"]
 class ImaginationActorCritic(WorldModelAgent):
     r"""Learns to act on beliefs (paper §3.2, algorithm 1). Dreamer is the same with `GaussianBelief` and N = 1.
 
-    Three losses, taken at the same parameters and minimised in one step; each trains its own networks only:
+    An update minimises three losses in one step; each trains its own networks only
+    (`control/actor_critic.py` has the algorithm):
 
     .. math::
 
@@ -32,33 +33,33 @@ class ImaginationActorCritic(WorldModelAgent):
         L_{actor} = -\overline{w_\tau (V_\tau - \eta \log \pi(a_{\tau-1}))}, \qquad
         L_{critic} = \overline{w_\tau \tfrac12 (v(f_\tau) - \mathrm{sg}(V_\tau))^2}
 
-    with the features :math:`f = [h, s]`, and λ-returns V along H imagined steps from N samples of the belief at every
-    step of every sequence, and :math:`w_\tau = \gamma^{\tau-1}`. Where the paper sums over N, the bar is a mean; Adam
-    does not see the factor. An actor of discrete actions has a categorical policy, and learns by straight-through
+    with the features :math:`f = [h, s]`, the λ-returns V along H imagined steps from N samples of the belief at every
+    step of every sequence, and :math:`w_\tau = \gamma^{\tau-1}`. The bar is a mean also over N, where the paper has a
+    sum; Adam does not depend on this factor. For discrete actions the policy is categorical, with straight-through
     gradients.
 
-    With `continuation`, :math:`L_{model}` has the term :math:`-\overline{\log p(c_t \mid f_t)}` too, where
-    :math:`c_t` is 0 if the episode ended in step t by itself, else 1. A discount is then
-    :math:`\gamma_\tau = \gamma\,p(c_\tau = 1 \mid f_\tau)`, the weights are :math:`w_\tau = \prod_{k<\tau} \gamma_k`,
-    and what is imagined from where an episode has ended does not count (Dreamer's `pcont`, off in its published runs
-    and in the paper).
+    With `continuation`, :math:`L_{model}` has the additional term :math:`-\overline{\log p(c_t \mid f_t)}`, where
+    :math:`c_t` is 0 if the episode terminated in step t, else 1. The discounts are then
+    :math:`\gamma_\tau = \gamma\,p(c_\tau = 1 \mid f_\tau)`, the weights :math:`w_\tau = \prod_{k<\tau} \gamma_k`,
+    and trajectories that start where an episode has terminated do not count (Dreamer's `pcont`, off in its published
+    runs and in the paper).
 
     Args:
-        trajectories: N.
-        horizon: H, at least 2.
-        discount: :math:`\gamma`.
+        trajectories: imagined trajectories per belief, N.
+        horizon: imagined steps, H, at least 2.
+        discount: discount factor :math:`\gamma`.
         lambda_: :math:`\lambda` of the returns.
         control_dim: width of actor, critic and reward.
-        actor_entropy: :math:`\eta`, the reward of a nat (DreamerV2, arXiv 2010.02193), 0 in paper and Dreamer. With
-            it, an actor that a model still wrong has driven to the border of the actions can come back.
-        actor_min_std: :math:`\sigma_{min}` of the actor before its tanh. At Dreamer's 1e-4 an actor that sees no use in
-            straying ends up deterministic, and learns from what it already does; DreamerV2's is 0.1.
-        continuation: learn where episodes end; needed where they end by themselves, not by a time limit.
+        actor_entropy: :math:`\eta`, the reward of a nat of entropy (DreamerV2, arXiv 2010.02193), 0 in paper and
+            Dreamer. It lets an actor return from the border of the action space, where an early model may drive it.
+        actor_min_std: :math:`\sigma_{min}` of the actor before its tanh. At Dreamer's 1e-4 an actor may become
+            deterministic and stop exploring; DreamerV2's is 0.1.
+        continuation: learn where episodes terminate; needed where they do so other than by a time limit.
         actor_layers: hidden layers of the actor.
         critic_layers: hidden layers of the critic.
         actor_rate: learning rate of the actor.
         critic_rate: learning rate of the critic.
-        **acting: arguments of `WorldModelAgent` and `WorldModel`; their learning rate is that of model and reward.
+        **acting: arguments of `WorldModelAgent` and `WorldModel`, whose learning rate is that of model and reward.
 
     Raises:
         ForbesError: when N or a size is below 1, H below 2, or the data have no actions.
@@ -109,7 +110,7 @@ class ImaginationActorCritic(WorldModelAgent):
         return self.continues is not None
 
     def action_selector(self, exploring: bool) -> ActionSelector:
-        """See `WorldModelAgent.action_selector`: a draw with noise, or the mode."""
+        """See `WorldModelAgent.action_selector`: a sample with noise, or the mode."""
         return explore(self.actor, self.exploration) if exploring else greedy(self.actor)
 
     def loss_terms(self, batch: SequenceBatch) -> list[Callable[[], LossTerm]]:
@@ -154,7 +155,7 @@ class ImaginationActorCritic(WorldModelAgent):
         )
 
     def groups(self) -> list[Group]:
-        """See `SeededModule.groups`: three, so that no gradient is scaled down for another's sake."""
+        """See `SeededModule.groups`: three, so that clipping one gradient does not shrink the others."""
         world = filter(None, (self.model, self.reward, self.continues))
         return [
             Group("model", [p for part in world for p in part.parameters()], self.learning_rate),

@@ -16,7 +16,6 @@ from forbes.pomdps import CategoricalBelief, Process
 from forbes.pomdps.base import require_positive
 from forbes.pomdps.distributions import PointMass
 from forbes.seeding import generator
-from forbes.training.divergence import hold_unless_finite
 from forbes.training.seeded import SeededModule
 
 __all__ = ["KnownBelief", "Objective", "has_transition_density"]
@@ -24,7 +23,7 @@ __all__ = ["KnownBelief", "Objective", "has_transition_density"]
 Objective = Literal["state_nll", "elbo"]
 
 _EXAMPLES, _STEPS = 1000, 30
-"""Sequences, and their length, that the units of states and observations are taken from."""
+"""Number and length of the sequences that standardise states and observations."""
 
 
 class KnownBelief(SeededModule):
@@ -35,23 +34,23 @@ class KnownBelief(SeededModule):
     .. math:: L_{nll} = -\frac1T \sum_t \log q(s_t \mid o_{1:t}), \quad (s, o) \sim p, \qquad
               L_{elbo} = -\frac1T\, E_q\left[\log p(s, o) - \log q(s \mid o)\right]
 
-    The first is a proper score: its minimum is the exact belief, and what exceeds it is KL(exact ‖ q). The second is
-    what world models are trained by, and prefers a belief that is too narrow (`forbes theorem`).
+    The first is a proper score: it is minimal for the exact belief, and exceeds this minimum by KL(exact ‖ q). The
+    second trains world models, and prefers a belief that is too narrow (`forbes theorem`).
 
     Args:
-        process: e.g. `MirrorSensor`; the same as the data's.
+        process: the known process, e.g. `MirrorSensor`; the same as that of the data.
         belief: the family of q, a class of `forbes.beliefs` with its own arguments.
-        objective: "state_nll", which sees the states, or "elbo".
-        observation_shape: of one observation; the command line takes it from the data.
-        action_dim: A; likewise.
-        hidden_dim: H of the GRU that reads the observations.
-        mlp_dim: width of the perceptron between the GRU and the belief.
-        mlp_layers: layers of it.
-        learning_rate: of Adam at the start; it falls to 0 along a cosine.
-        seed: of the noise of training and validation.
+        objective: "state_nll", which uses the true states, or "elbo".
+        observation_shape: shape of one observation; the command line takes it from the data.
+        action_dim: dimensions of an action, A; the command line takes it from the data.
+        hidden_dim: dimensions of the GRU's state, H.
+        mlp_dim: width of the MLP between the GRU and the belief.
+        mlp_layers: layers of this MLP.
+        learning_rate: learning rate of Adam at the start. It falls to 0 along a cosine.
+        seed: random seed of the noise of training and validation.
 
     Raises:
-        ForbesError: where the data are not of the process, the process lacks a density that the objective needs, or a
+        ForbesError: when the data are of another process, the process lacks a density that the objective needs, or a
             size or the rate is not above 0.
 
     Example:
@@ -97,7 +96,7 @@ class KnownBelief(SeededModule):
         self.require_data(self.trainer.datamodule)  # type: ignore[attr-defined]
 
     def require_data(self, data: SequenceDataModule) -> None:
-        """Refuse data of another process; the same one draws the same sequences from the same noise."""
+        """Refuse data of another process. Equal processes sample equal sequences from the same noise."""
         source = data.source
         if not isinstance(source, Simulated):
             raise _not_its_data(self.process, f"those of {type(source).__name__}")
@@ -134,18 +133,18 @@ class KnownBelief(SeededModule):
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Make no step where the gradient is not finite."""
         gradients = [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
-        hold_unless_finite(optimizer, torch.nn.utils.get_total_norm(gradients), self.global_step)
+        self.hold_unless_finite(optimizer, torch.nn.utils.get_total_norm(gradients))
 
 
 def has_transition_density(process: Process) -> bool:
-    """Tell whether p(s_t | s_{t-1}, a) is a density; of certain steps it is not."""
+    """Return whether p(s_t | s_{t-1}, a) is a density. It is none where the transition is deterministic."""
     zeros = torch.zeros(1, process.state_dim + process.action_dim)
     state, action = zeros.split((process.state_dim, process.action_dim), -1)  # (1, D), (1, A)
     return not isinstance(process.transition(state, action), PointMass)
 
 
 def _require_density(process: Process, objective: Objective) -> None:
-    """Refuse finite states, and the ELBO where there is no p(s_t | s_{t-1}, a) to put into it."""
+    """Refuse finite states, and the ELBO where p(s_t | s_{t-1}, a) is no density."""
     name = type(process).__name__
     if isinstance(process.initial(torch.zeros(1)), CategoricalBelief):
         raise ForbesError(f"KnownBelief: the states of {name} are finite, expected a density. Train a WorldModel on it")

@@ -7,11 +7,12 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, cast
 import torch
 from lightning import LightningModule
 from torch import Tensor, nn
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from forbes.data import SequenceBatch
 from forbes.seeding import derive_seed
+from forbes.training.divergence import hold_unless_finite
 
 __all__ = ["Group", "Schedule", "SeededModule"]
 
@@ -82,6 +83,10 @@ class SeededModule(LightningModule, ABC):
         groups = scheduler.optimizer.param_groups
         for group, rate, factor in zip(groups, scheduler.base_lrs, scheduler.lr_lambdas, strict=True):
             group["lr"] = rate * factor(scheduler.last_epoch)
+
+    def hold_unless_finite(self, optimizer: Optimizer, norm: Tensor) -> None:
+        """Let the optimiser change nothing from this update on, if the norm of a gradient is not finite."""
+        hold_unless_finite(optimizer, norm, self.global_step)
 
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
         """Seed the noise of this batch, so that a resumed run draws the same."""

@@ -20,7 +20,6 @@ from forbes.models.state_space import StateSpaceModel
 from forbes.runs.hyperparameters import plain_arguments
 from forbes.signatures import full_signature
 from forbes.training.defaults import defaults_for
-from forbes.training.divergence import hold_unless_finite
 from forbes.training.requirements import require_mean, require_path, require_rank
 from forbes.training.seeded import Schedule, SeededModule
 
@@ -47,30 +46,30 @@ class WorldModel(SeededModule):
         encoder: o_t to e_t, a class of `forbes.models.networks`.
         decoder: features to the likelihood's parameters, likewise.
         likelihood: what the decoder's output means; `Normal()` by default.
-        observation_shape: of one observation; the command line takes it from the data.
-        action_dim: A; likewise.
-        state_dim: D of s; 0 for a `VectorModel`.
-        hidden_dim: H of the GRU.
-        mlp_dim: width of every perceptron.
-        mlp_layers: layers of every perceptron.
-        activation: of every perceptron; convolutions and flows keep their ReLU.
-        kl: how the KL is differentiated. "analytic" by its closed form where the family has one, else as "path": at the
-            posterior's sample, through the sample alone; "monte_carlo" through the posterior's parameters too, a noise
-            that costs a flow thousands of updates.
+        observation_shape: shape of one observation; the command line takes it from the data.
+        action_dim: dimensions of an action, A; the command line takes it from the data.
+        state_dim: dimensions of s, D; 0 for a `VectorModel`.
+        hidden_dim: dimensions of h, the GRU's state, H.
+        mlp_dim: width of every MLP.
+        mlp_layers: layers of every MLP.
+        activation: activation of every MLP; convolutions and flows keep their ReLU.
+        kl: how the KL is differentiated. "analytic": by its closed form where the family has one, else as "path".
+            "path": at the posterior's sample, through the sample alone. "monte_carlo": through the posterior's
+            parameters too; this noise costs a flow thousands of updates.
         free_nats: the KL below this, in nats per step, costs nothing in training.
         free_nats_per: "batch" applies them to the mean over batch and time, "element" to each step.
         kl_warmup: updates over which the weight of the KL rises from 0 to 1.
-        learning_rate: of Adam (eps 1e-7).
+        learning_rate: learning rate of Adam (eps 1e-7).
         schedule: "constant", or "cosine" to 0 at the end of the training.
         warmup: updates over which the learning rate rises from 0; a high rate needs it.
         clip_norm: gradients are scaled down to this norm.
-        center: measure the mean observation on the first batch; encoder and decoder then see what differs from it. The
-            same models, found several times faster where most of a frame never changes; for Gaussian likelihoods.
-        seed: of the noise of training and validation.
+        center: measure the mean observation on the first batch. Encoder and decoder then work on the difference to it.
+            This learns several times faster where most of a frame never changes. For Gaussian likelihoods.
+        seed: random seed of the noise of training and validation.
 
     Raises:
         ForbesError: when a size is below 1, the learning rate or `clip_norm` below 0, or `likelihood` or `center` does
-            not fit.
+            not fit the other arguments.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
@@ -141,18 +140,18 @@ class WorldModel(SeededModule):
     __signature__: ClassVar[inspect.Signature]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Show the arguments of `WorldModel` in the signature of every class that derives from it, too."""
+        """Show the arguments of `WorldModel` in the signature of every subclass."""
         super().__init_subclass__(**kwargs)
         cls.__signature__ = full_signature(cls)
 
     @classmethod
     def for_data(cls, data: SequenceDataModule, **options: Any) -> Self:
-        """Build a model for these data: their shapes and seed, and networks and a likelihood that fit them.
+        """Build a model with the shapes and the seed of the data, and with networks and a likelihood that fit them.
 
         Args:
-            data: with the source that the model is to learn.
-            **options: arguments of the constructor by name. What is not given is as in `configs/` for such data (see
-                `defaults_for`).
+            data: the data that the model learns.
+            **options: arguments of the constructor by name. The others have the values of `configs/` for such data
+                (see `defaults_for`).
         """
         of_data = {"observation_shape": data.observation_shape, "action_dim": data.action_dim, "seed": data.seed}
         arguments: dict[str, Any] = of_data | defaults_for(data.source) | options
@@ -164,11 +163,11 @@ class WorldModel(SeededModule):
     def load_from_checkpoint(  # type: ignore[override]  # without what would unpickle
         cls, checkpoint_path: Path | str, map_location: torch.device | str = "cpu", **arguments: Any
     ) -> Self:
-        """Load a trained model. Only tensors and plain values are read, and nothing is unpickled.
+        """Load a trained model. Only tensors and plain values are read; nothing is unpickled.
 
         Args:
-            checkpoint_path: a checkpoint of a run folder, whose config.yaml has the arguments of the model, or one that
-                a plain `Trainer` saved, which has those itself if the model was built by `for_data`.
+            checkpoint_path: a checkpoint of a run folder, whose config.yaml has the arguments of the model, or a
+                checkpoint of a plain `Trainer`, which has the arguments itself if the model was built by `for_data`.
             map_location: device of the loaded model.
             **arguments: arguments of the constructor that replace those the model was trained with. For a run folder
                 they are plain values, as in config.yaml.
@@ -235,14 +234,14 @@ class WorldModel(SeededModule):
     def configure_gradient_clipping(
         self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """Clip each group to `clip_norm` and log the norm before; make no step where a norm is not finite."""
+        """Clip each group to `clip_norm`, log its norm before, and make no step if a norm is not finite."""
         for group in self.groups():
             norm = torch.nn.utils.clip_grad_norm_(group.parameters, self.clip_norm, foreach=True)
             self.log(f"train/gradient_norm_{group.name}", norm)
-            hold_unless_finite(optimizer, norm, self.global_step)
+            self.hold_unless_finite(optimizer, norm)
 
     def measures(self, terms: ElboTerms) -> dict[str, Tensor]:
-        """Return means in nats per sequence, auxiliary losses per step: the bound without free nats, and its parts."""
+        """Return the bound without free nats and its parts in nats per sequence, and auxiliary losses per step."""
         parts = {
             "reconstruction": (terms.reconstruction * terms.mask).sum(1).mean(),
             "kl": (terms.kl * terms.mask).sum(1).mean(),

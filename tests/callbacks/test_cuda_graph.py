@@ -120,7 +120,7 @@ def test_a_loss_that_changes_by_itself_is_refused(tmp_path, capsys):
     config.write_text(config.read_text().replace(*WITH))
 
     assert fit("--config", config, "--model.kl_warmup", 10, "--run_dir", tmp_path / "run") == 2
-    assert "CudaGraph: kl_warmup weighs every update anew, expected 0" in capsys.readouterr().err
+    assert "CudaGraph: kl_warmup changes the loss between updates, expected 0" in capsys.readouterr().err
 
 
 def test_what_is_no_world_model_is_refused():
