@@ -1,4 +1,4 @@
-"""What agents earn: whole episodes without exploration, each agent in the same ones."""
+"""Evaluate agents: their returns in whole episodes without exploration, the same episodes for every agent."""
 
 import sys
 from collections.abc import Iterator, Mapping
@@ -30,28 +30,27 @@ __all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", 
 DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
 REWARD = "reward_uncertainty"
 _APART = ("made_by", "shows", "observation_shape")
-"""In what environments of one task may differ: an agent that is shown the exact belief earns the same rewards."""
+"""Fields in which environments of one task may differ: the rewards do not depend on what the agent is shown."""
 
 
 class PlayedAgent(NamedTuple):
-    """A run and the episodes it was measured in."""
+    """A run and its results in the test episodes."""
 
     run: str
     agent: WorldModelAgent
     returns: Tensor
-    """Undiscounted, `(E,)`, float64."""
+    """Undiscounted return of each episode, `(E,)`, float64."""
     explained: list[Estimate | None]
-    """The share of the rewards' variance that the world model foretold, for each of `STEPS_AHEAD`."""
+    """R² of the predicted rewards, for each of `STEPS_AHEAD`."""
     belief: dict[str, Estimate]
-    """What is said of the belief, by metric: `DISTANCES` from a Gaussian, where s is
-    continuous, and `REWARD`, where the exact belief is known."""
+    """Metrics of the belief: `DISTANCES` from a Gaussian if s is continuous, `REWARD` if the exact belief is known."""
     environment: dict[str, Any]
     checkpoint: str
-    """SHA-256 of the one that has played."""
+    """SHA-256 of the evaluated checkpoint."""
 
 
 def is_agent(run: str) -> bool:
-    """Tell whether a run folder holds an agent, which is measured by what it earns."""
+    """Return whether a run folder holds an agent, which is evaluated by its returns."""
     module, data = load_run(run)
     if isinstance(data.source, Experience):
         data.source.close()
@@ -63,19 +62,19 @@ def evaluate_agents(
 ) -> list[PlayedAgent]:
     """Let every agent play the same episodes, and record its returns.
 
-    Episode k of every run is reset with the same seed, none of which was used in a training. The action is the policy's
-    mode, or the plan, without noise.
+    Episode k is reset with the same seed for every run, and no such seed was used in training. Actions are the mode of
+    the policy, or the plan, without noise.
 
     Args:
         runs: run folders, and the folder for the record of each.
-        episodes: E, at least 2.
-        samples: K, trajectories of the belief that each action is chosen by; None for the agent's own.
-        seed: of the episodes.
-        device: of the models.
-        command: for the record.
+        episodes: number of episodes, E, at least 2.
+        samples: number of belief samples per action, K; None for the agent's own number.
+        seed: random seed for the episodes.
+        device: device of the models.
+        command: command line, for the record.
 
     Raises:
-        ForbesError: where a run is not an agent's, or its task is another than the first's.
+        ForbesError: if a run does not hold an agent, or its task differs from that of the first run.
     """
     if episodes < 2:
         raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
@@ -117,7 +116,7 @@ def _play(
 
 
 def _known_process(environment: EnvironmentProcess) -> Process | None:
-    """Return the process behind an environment that shows its observations, if its belief is known exactly."""
+    """Return the environment's process if it shows observations and its exact belief is known, else None."""
     if environment.describe().get("shows") != "observation":
         return None
     known = environment.make()
@@ -151,12 +150,12 @@ def _record(one: PlayedAgent, folder: Path, seed: int, command: str) -> None:
 
 
 def play_test_episode(agent: WorldModelAgent, environment: Environment, seed: int, number: int) -> Episode:
-    """Play an episode of a test, which was not in the training: for every agent, the same seed is the same episode."""
+    """Play a test episode, which was not used in training. The same seed gives every agent the same episode."""
     return play_measured(agent, environment, "test episode", seed, number)
 
 
 def _counted(run: str, episodes: int) -> Iterator[int]:
-    """Count, and say how far it is."""
+    """Yield the number of each episode, and print progress after it."""
     for number in range(episodes):
         yield number
         print(f"{run}: {number + 1}/{episodes} episodes", file=sys.stderr, flush=True)

@@ -300,9 +300,9 @@ def test_one_process_can_be_chosen(capsys):
         (["--steps", "0"], "0 is not a number above 0"),
         (["--steps", "201"], "201 is above 200"),
         (["--samples", "1"], "1 is below 2, a standard error needs two"),
-        (["--samples", "3000000"], "--samples 3000000: expected at most 2000000 of 15 steps"),
-        (["--transition", "40", "--steps", "100"], "F=40 Q=1 R=1: with 100 steps the numbers leave the precision"),
-        (["--transition", "4", "--steps", "20"], "F=4 Q=1 R=1: with 20 steps the numbers leave the precision"),
+        (["--samples", "3000000"], "--samples 3000000: expected at most 2000000 with 15 steps"),
+        (["--transition", "40", "--steps", "100"], "F=40 Q=1 R=1: with 100 steps the precision of float64"),
+        (["--transition", "4", "--steps", "20"], "F=4 Q=1 R=1: with 20 steps the precision of float64"),
         (["surplus"], "unrecognized arguments: surplus"),
     ],
 )

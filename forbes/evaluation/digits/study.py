@@ -1,4 +1,4 @@
-"""Completions of several runs on the same digits, side by side: scores, paired differences, a record and tables."""
+"""Compare completions of several runs on the same digits: scores, paired differences, record and tables."""
 
 import math
 import sys
@@ -28,21 +28,21 @@ __all__ = ["Row", "Study", "entries", "print_study", "study"]
 
 
 class Row(NamedTuple):
-    """What completions of one kind score; of the reference, which completes nothing, the scores of the class only."""
+    """Scores of one kind of completions. The reference completes nothing and has the scores of the class only."""
 
     name: str
     path: str | None
-    """Of the run; None where no model is asked."""
+    """Run folder; None if there is no model."""
     scores: Mapping[str, Tensor]
-    """Of each digit, `(B,)`, by score and step: `js[end]`."""
+    """Score of each digit, `(B,)`, by score and step, e.g. `js[end]`."""
     calibration: float
-    """ECE of the class, one number for all digits."""
+    """ECE of the class over all digits."""
     classes: Tensor
-    """Distribution of the class for each digit, `(B, 10)`."""
+    """Class distribution of each digit, `(B, 10)`."""
     best: Sequence[float] = ()
     """Expected error of the best of n completions, n = 1 … N, mean over digits."""
     average: Sequence[float] = ()
-    """Expected error of the average picture of n completions."""
+    """Expected error of the average image of n completions, n = 1 … N, mean over digits."""
 
 
 class Study(NamedTuple):
@@ -50,18 +50,18 @@ class Study(NamedTuple):
 
     prefixes: Prefixes
     samples: int
-    """N."""
+    """Number of completions, N."""
     reference: Row
-    """The prefix classifier."""
+    """Scores of the prefix classifier."""
     runs: list[Row]
     similar: Row
-    """The training digits that begin most alike, in place of completions."""
+    """Scores of the training digits with the most similar beginnings, as completions."""
     truth: Row
-    """The true digits, in place of completions."""
+    """Scores of the true digits, as completions."""
 
     @property
     def differences(self) -> list[tuple[Row, Row, dict[str, Estimate]]]:
-        """Return the mean difference of the first run to each other one, paired over digits."""
+        """Mean difference of the first run minus each other run, paired over digits."""
         first = self.runs[0]
         return [
             (first, other, {name: Estimate.of(values - other.scores[name]) for name, values in first.scores.items()})
@@ -72,21 +72,21 @@ class Study(NamedTuple):
 def study(
     runs: Mapping[str, TrainedRun], judges: DigitClassifiers, prefixes: Prefixes, split: Split, samples: int, seed: int
 ) -> Study:
-    """Complete the same beginnings by every run.
+    """Complete the same prefixes with every run, and score the completions.
 
     Args:
-        runs: by the name that tells them apart, on the same data.
-        judges: the classifiers of these data.
-        prefixes: the beginnings.
-        split: of the digits.
-        samples: N completions of each.
-        seed: of the noise, the same for every run.
+        runs: runs on the same data, by title.
+        judges: classifiers of these data.
+        prefixes: prefixes to complete.
+        split: split of the digits.
+        samples: number of completions per digit, N.
+        seed: random seed for the noise, the same for every run.
     """
     first = next(iter(runs.values()))
     data, length, context = first.data, first.data.length, prefixes.context
 
     def measure(name: str, path: str | None, run: TrainedRun, score: Scorer) -> Row:
-        where = f"{name}, {split} digits in the order of their length"
+        where = f"{name}, {split} digits sorted by length"
         batches = with_progress(prefixes.batches(data, split), f"{name}, {context} steps seen", len(prefixes.digits))
         readings = score_split(run.model, batches, score, seed, where).values
         classes, scores = readings["classes"], summarise(readings, prefixes, length)
@@ -95,23 +95,23 @@ def study(
 
     classes = prefixes.reference
     error = calibration_error(classes, prefixes.labels)
-    own = model_pass(data, context, samples, judges)
+    scorer = model_pass(data, context, samples, judges)
     return Study(
         prefixes,
         samples,
         Row("reference", None, summarise_classes(classes, prefixes), error, classes),
-        [measure(name, run.path, run, own) for name, run in runs.items()],
+        [measure(name, run.path, run, scorer) for name, run in runs.items()],
         measure("similar digits", None, first, neighbour_pass(data, context, samples, judges)),
         measure("true digits", None, first, truth_pass(data, context, judges)),
     )
 
 
 def entries(study: Study, digits: str) -> list[dict[str, Any]]:
-    """List every score of every row by its full name, with differences; for `completions.json`.
+    """Return all scores and differences by full name, as entries for `completions.json`.
 
     Args:
-        study: of one length of the prefix.
-        digits: what the prefixes are of, e.g. `test[:300]`.
+        study: results for one length of the prefix.
+        digits: name of the digits, e.g. `test[:300]`.
     """
     context = study.prefixes.context
 
@@ -130,12 +130,12 @@ def entries(study: Study, digits: str) -> list[dict[str, Any]]:
 
 
 def _entry(estimate: Estimate) -> dict[str, float | None]:
-    """JSON has no NaN."""
+    """Return an estimate for JSON, with None for NaN."""
     return {key: value if math.isfinite(value) else None for key, value in estimate._asdict().items()}
 
 
 def print_study(study: Study, length: int) -> None:
-    """Print a table of classes and one of pixels."""
+    """Print a table of class scores and a table of pixel scores."""
     title = f"{len(study.prefixes.digits)} digits, {study.prefixes.context} steps seen, {study.samples} completions"
     of_classes = {
         "js[end]": "JS to the\nreference",

@@ -74,7 +74,7 @@ def test_the_prefixes_are_the_digits_that_go_on_in_the_order_of_their_length(dat
 
 def test_too_few_digits_that_go_on_are_an_error(data, judges):
     longest = int(data.source.steps("test")[:20].max())
-    with pytest.raises(ForbesError, match=rf"--prefixes {longest}: of 20 digits 0 go on after {longest} steps"):
+    with pytest.raises(ForbesError, match=rf"--prefixes {longest}: of 20 digits 0 continue after {longest} steps"):
         prefixes(data, "test", 20, longest, judges.prefix)
 
 
