@@ -1,4 +1,4 @@
-"""`forbes calibrate`: whether a trained model's filter is the exact one of its own process."""
+"""`forbes calibrate`: check whether a trained model's filter is exact for the model's own process."""
 
 import sys
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _check(run: TrainedRun, sequences: int, time: int, samples: int, seed: int) -> SelfCalibration:
-    """Check one run; actions are those of its training split, from the first sequence on."""
+    """Check one run, with the actions of the first sequences of its training split."""
     if not isinstance(run.model, StateSpaceModel):
         raise ForbesError(f"{run.path}: a {run.family} model has no state that could be ranked. Name other runs")
     size = run.data.source.size("train")
@@ -51,12 +51,12 @@ def _check(run: TrainedRun, sequences: int, time: int, samples: int, seed: int) 
     action = run.data.sequences("train", torch.arange(sequences), time).action
     try:
         return self_calibration(run.model, action, samples, seed)
-    except ForbesError as error:  # where the training has diverged, say
+    except ForbesError as error:  # e.g. if the training diverged
         raise ForbesError(f"{run.path}: {error}") from error
 
 
 def _print(runs: Sequence[TrainedRun], found: Sequence[SelfCalibration], samples: int) -> None:
-    table = Table(title=f"{len(found[0].density)} states drawn from the model, ranked among {samples} of the belief")
+    table = Table(title=f"{len(found[0].density)} states sampled from the model, ranked among {samples} of the belief")
     for header in ("run", "family"):
         table.add_column(header, overflow="fold")
     for header in ("within 90 %", "p, density", "p, TARP", "p, values (smallest of D, times D)", "p, classifier"):

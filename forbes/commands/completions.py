@@ -1,4 +1,4 @@
-"""`forbes completions`: whether predictions of digits are precise yet diverse, in numbers and in pictures."""
+"""`forbes completions`: score and draw sampled completions of digits."""
 
 import json
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from forbes.runs.provenance import command_line, commit
 
 __all__ = ["main"]
 
-_DRAWN = 10  # digits in a picture
+_DRAWN = 10  # digits per figure
 
 
 def main(argv: Sequence[str]) -> None:
@@ -52,7 +52,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _check(args: Any, runs: Sequence[TrainedRun]) -> None:
-    """Say what does not fit before minutes are spent."""
+    """Check the arguments before minutes are spent."""
     for run in runs:
         if not isinstance(run.data.source, Strokes):
             raise ForbesError(f"{run.path}: its data are {data_name(run.data)}, expected Strokes. Name other runs")
@@ -74,7 +74,7 @@ def _describe(name: str, run: TrainedRun) -> dict[str, Any]:
 
 
 def _write(args: Any, record: dict[str, Any], studies: Sequence[Study]) -> None:
-    """Write every score with its paired differences, and the curves over n."""
+    """Write all scores, paired differences, and the curves over n."""
     found = [entry for one in studies for entry in entries(one, f"{args.split}[:{args.sequences}]")]
     curves = [
         {"row": row.name, "c": one.prefixes.context, "best": row.best, "average": row.average}

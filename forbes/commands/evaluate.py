@@ -1,4 +1,4 @@
-"""`forbes evaluate`: bounds and proper scores of trained models, and the paired difference of each two."""
+"""`forbes evaluate`: bounds and proper scores of trained models, with paired differences."""
 
 import itertools
 import sys
@@ -38,13 +38,14 @@ __all__ = ["evaluate", "main", "wanted_metrics"]
 
 
 class _Job(NamedTuple):
-    """A pass over the first so many sequences of a split."""
+    """A scorer and the number of sequences that it scores."""
 
     name: str
     score: Scorer
     sequences: int
+    """Number of sequences, from the first of the split."""
     sha256: list[str]
-    """Of the sequences, as each run's data give them."""
+    """Hash of the sequences in each run's data."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -69,13 +70,13 @@ def main(argv: Sequence[str]) -> None:
 def evaluate(
     paths: Sequence[str], args: Any, command: str, folders: Mapping[str, Path] | None = None
 ) -> list[EvaluatedRun]:
-    """Measure runs on the same sequences and record it.
+    """Evaluate runs on the same sequences and record the results.
 
     Args:
         paths: run folders.
-        args: with the options of `forbes.commands.parsers.evaluate.add_score_options`.
-        command: for the record.
-        folders: where the record of each run goes; into the run by default.
+        args: parsed options of `forbes.commands.parsers.evaluate.add_score_options`.
+        command: command line, for the record.
+        folders: folder for the record of each run. Default: the run folder itself.
     """
     folders = folders or results_folders(paths)
     require_readable(folders.values())
@@ -102,7 +103,7 @@ def evaluate(
 
 
 def _add_references(one: EvaluatedRun, jobs: Sequence[_Job], split: Split) -> None:
-    """Put beside each score what references have on the same steps of the same sequences."""
+    """Add to each score the scores of the reference models on the same steps of the same sequences."""
     found: dict[int, dict[str, Tensor]] = {}
     for job in _of(one.run, jobs):
         scores = [metric for metric in job.score.metrics if metric in SCORES]
@@ -116,7 +117,7 @@ def _add_references(one: EvaluatedRun, jobs: Sequence[_Job], split: Split) -> No
 
 
 def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[dict[str, bool]]:
-    """Name the metrics that `evaluate` measures runs by, and tell for each run whether its model has them."""
+    """Return for each run the full names of the metrics of `evaluate`, and whether its model has each of them."""
     jobs = _jobs(args, runs)
     return [
         {
@@ -159,21 +160,21 @@ def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
 
 
 def _require_longer(run: TrainedRun, args: Any, count: int) -> None:
-    """Refuse sequences that end within the context: nothing of them would be left to score."""
+    """Refuse sequences that end within the context, since no step would be left to score."""
     for first, batch in split_batches(run.data, args.split, count, batch_size=500):
         length = batch.mask.sum(1)  # (B,)
         if (length <= args.context).any():
-            place = int(length.argmin())
+            row = int(length.argmin())
             raise ForbesError(
-                f"--context {args.context}: sequence {first + place} of the {args.split} split of {run.path} has "
-                f"{length[place]} steps, expected more. Choose a smaller context, or name other --scores"
+                f"--context {args.context}: sequence {first + row} of the {args.split} split of {run.path} has "
+                f"{length[row]} steps, expected more. Choose a smaller context, or name other --scores"
             )
 
 
 def _of(run: TrainedRun, jobs: Sequence[_Job]) -> list[_Job]:
-    """Leave out the scores that the run's model does not have."""
-    each = [job._replace(score=job.score.of(run.model)) for job in jobs]
-    return [job for job in each if job.score.metrics]
+    """Return the jobs of a run, without the scores that its model does not have."""
+    of_run = [job._replace(score=job.score.of(run.model)) for job in jobs]
+    return [job for job in of_run if job.score.metrics]
 
 
 def _count(run: TrainedRun, args: Any, default: int) -> int:
@@ -191,7 +192,7 @@ def _count(run: TrainedRun, args: Any, default: int) -> int:
 
 
 def _round_trip(run: TrainedRun, args: Any) -> dict[str, dict[str, Any]]:
-    """Measure, print and name how well its flows are inverted on the first batch of the split; {} of other families."""
+    """Measure and print the round-trip error of the flows on the first batch; return its entry, {} without flows."""
     _, batch = next(split_batches(run.data, args.split, _count(run, args, args.batch_size), args.batch_size))
     found = model_round_trip(run.model, batch, args.seed)
     print_round_trip(run.path, found)
@@ -206,7 +207,7 @@ def _round_trip(run: TrainedRun, args: Any) -> dict[str, dict[str, Any]]:
 
 
 def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
-    """Name a metric in full: `test[:1000]/pll[bernoulli,K=128]`."""
+    """Return the full name of a metric, e.g. `test[:1000]/pll[bernoulli,K=128]`."""
     whole = job.sequences == run.data.source.size(split)  # type: ignore[arg-type]  # argparse has checked it
     part = "" if whole else f"[:{job.sequences}]"
     tag = job.score.tag if job.name == "exact" else f"{run.model.likelihood.name},{job.score.tag}"
@@ -214,7 +215,7 @@ def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
 
 
 def _measure(one: EvaluatedRun, job: _Job, sha256: str, args: Any, folder: Path) -> PartialScores:
-    """Make a pass for a run and add what it finds; give the parts it has left, to be removed in the end."""
+    """Score a run and add the results to it. Return the saved partial scores, which are to be removed at the end."""
     run, score = one.run, job.score
     parts = PartialScores(
         folder / "evaluation-parts", run.checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed

@@ -1,4 +1,4 @@
-"""What `forbes evaluate` prints of agents."""
+"""The tables that `forbes evaluate` prints for agents."""
 
 import itertools
 import sys
@@ -16,7 +16,7 @@ __all__ = ["print_agents"]
 
 
 def print_agents(played: Sequence[PlayedAgent]) -> None:
-    """Print the returns, the reward predictions, the beliefs, and the difference of each two agents."""
+    """Print the returns, the reward predictions, the measures of the beliefs, and all paired differences."""
     console = Console(width=None if sys.stdout.isatty() else 160)
     episodes, how = len(played[0].returns), "undiscounted, mean ± standard error; the same episodes for all"
     table = Table(title=f"return in {episodes} episodes, by the mean action of K trajectories of the belief: {how}")
@@ -29,7 +29,7 @@ def print_agents(played: Sequence[PlayedAgent]) -> None:
         samples = str(one.agent.acting_samples)
         table.add_row(escape(one.run), kind, f"{size:,}", samples, str(Estimate.of(one.returns)), *ends)
     console.print(table)
-    console.print(_foresight(played))
+    console.print(_reward_prediction(played))
     if any(one.belief for one in played):
         console.print(_beliefs(played))
     for first, second in itertools.combinations(played, 2):
@@ -37,19 +37,19 @@ def print_agents(played: Sequence[PlayedAgent]) -> None:
         console.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
 
 
-def _foresight(played: Sequence[PlayedAgent]) -> Table:
-    title = "share of the rewards' variance in these episodes that the world model foretells, by the actions taken"
-    table = Table("run", title=f"{title}; 0 is as good as the mean reward")
+def _reward_prediction(played: Sequence[PlayedAgent]) -> Table:
+    title = "R² of the rewards in these episodes, predicted by the world model for the actions taken"
+    table = Table("run", title=f"{title}; 0 is no better than the mean reward")
     for distance in STEPS_AHEAD:
-        table.add_column(f"{distance} steps ahead" if distance else "when seen", justify="right")
+        table.add_column(f"{distance} steps ahead" if distance else "current step", justify="right")
     for one in played:
         table.add_row(escape(one.run), *("n/a" if share is None else str(share) for share in one.explained))
     return table
 
 
 def _beliefs(played: Sequence[PlayedAgent]) -> Table:
-    table = Table("run", title="the belief: its KL from the nearest Gaussian; how unsure it is of a reward it has met")
-    for column in ("prior, nats a step", "posterior, nats a step", "variance of the reward / exact belief's"):
+    table = Table("run", title="belief: KL from the nearest Gaussian, and variance of the reward it has just observed")
+    for column in ("prior, nats per step", "posterior, nats per step", "variance of the reward / exact belief's"):
         table.add_column(column, justify="right")
     for one in played:
         *distances, reward = (one.belief.get(metric) for metric in (*DISTANCES, REWARD))

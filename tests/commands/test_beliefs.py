@@ -148,13 +148,13 @@ def test_what_cannot_be_measured_is_one_sentence(run, tiny_run, tmp_path, capsys
     for arguments, sentence in [
         (
             ["beliefs", tiny_run],
-            f"{tiny_run}: a run of WorldModel, expected one of KnownBelief. Measure it with: forbes",
+            f"{tiny_run}: a run of WorldModel, expected one of KnownBelief. Use instead: forbes",
         ),
         (
             ["evaluate", run],
-            f"{run}: a run of KnownBelief, expected one of WorldModel. Measure it with: forbes beliefs",
+            f"{run}: a run of KnownBelief, expected one of WorldModel. Use instead: forbes beliefs",
         ),
-        (["beliefs", run], f"--sequences 200: the test split of {run} has 12, expected 2 to that"),
+        (["beliefs", run], f"--sequences 200: the test split of {run} has 12, expected 2 to 12"),
         (["beliefs", run, "--sequences", "1"], "--sequences 1: "),
         (["beliefs", run, other, *few], f"{other}: its data are Simulated("),
         (

@@ -154,7 +154,7 @@ def test_misspelt_arguments_of_a_class_are_named(tiny_config, tmp_path, capsys):
 
     sentence = error_of(capsys, "fit", "--config", str(config))
 
-    assert sentence == f"{config}: model.encoder: MLPEncoder: expected init_args beside class_path, found int_args"
+    assert sentence == f"{config}: model.encoder: MLPEncoder: expected init_args next to class_path, found int_args"
 
 
 def error_of(capsys, *arguments):
@@ -185,7 +185,7 @@ def error_of(capsys, *arguments):
         (["--batch_size", "1"], "batch_size: the configuration has no such option, did you mean data.batch_size?"),
         (["--points_per_step", "2"], "did you mean data.source.points_per_step?"),
         (["--exploration", "0"], "did you mean model.exploration?"),
-        (["mine.yaml"], "mine.yaml: a configuration needs its flag. Say: --config mine.yaml"),
+        (["mine.yaml"], "mine.yaml: a configuration needs its flag. Write: --config mine.yaml"),
         (
             ["--trainer.logger", "TensorBoardLogger", "--trainer.logger.savedir", "logs"],
             "trainer.logger.savedir: TensorBoardLogger has no such option, did you mean save_dir?",
@@ -212,7 +212,7 @@ def error_of(capsys, *arguments):
         (["--run_dir", "/proc/run"], "/proc/run: no such file or directory"),
         (["--resume", "a", "--run_dir", "b"], "not allowed with argument"),
         (["--allow-module", "no_such_module"], "--allow-module no_such_module: No module named 'no_such_module'"),
-        (["--allow-module"], "--allow-module: no name follows"),
+        (["--allow-module"], "--allow-module: the name is missing"),
     ],
 )
 def test_a_wrong_flag_is_one_sentence(flags, expected, tiny_config, in_tmp_path, capsys):
@@ -338,9 +338,7 @@ def test_a_trained_run_is_not_trained_over(tiny_config, tiny_run, capsys):
 
     sentence = error_of(capsys, "fit", "--config", str(tiny_config), "--run_dir", str(tiny_run))
 
-    assert (
-        sentence == f"{tiny_run}: holds a trained run. Name another, or go on with it: forbes fit --resume {tiny_run}"
-    )
+    assert sentence == f"{tiny_run}: holds a trained run. Name another, or resume it: forbes fit --resume {tiny_run}"
     assert (tiny_run / "metrics.jsonl").read_bytes() == before
 
 

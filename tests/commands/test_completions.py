@@ -105,7 +105,7 @@ def error_of(capsys, *arguments):
         (["--prefixes", "2", "6"], "--prefixes 6: the sequences of"),
         (["--samples", "1"], "--samples 1: expected at least 2"),
         (["--digits", "13"], "--sequences 13: the test split of"),
-        (["--digits", "1"], "of 1 digits 1 go on after 2 steps, expected at least 2"),
+        (["--digits", "1"], "of 1 digits 1 continue after 2 steps, expected at least 2"),
         (["--prefixes", "none"], "--prefixes"),
     ],
 )
@@ -129,7 +129,7 @@ def test_runs_that_do_not_fit_are_named(runs, tiny_config, tmp_path, capsys):
 
 def test_missing_classifiers_are_an_error(runs, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(classifiers, "classifiers_path", lambda: tmp_path / "classifiers.npz")
-    assert "classifiers.npz: there is no such file" in error_of(capsys, *runs, *NUMBERS)
+    assert "classifiers.npz: no such file" in error_of(capsys, *runs, *NUMBERS)
 
 
 def test_digits_are_drawn_from_the_most_to_the_least_ambiguous():
