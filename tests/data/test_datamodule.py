@@ -187,10 +187,10 @@ class Own(Simulated):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda batch: tuple(batch), "decode gives a tuple, expected a SequenceBatch"),
+        (lambda batch: tuple(batch), "decode returns a tuple, expected a SequenceBatch"),
         (
             lambda batch: batch._replace(observation=batch.observation.double()),
-            "decode gives observation float64 (2, 3, 2), expected float32 (2, 3, 2)",
+            "decode returns observation float64 (2, 3, 2), expected float32 (2, 3, 2)",
         ),
         (
             lambda batch: batch._replace(observation=batch.observation[..., :1]),

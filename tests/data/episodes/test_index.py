@@ -253,7 +253,7 @@ def test_a_line_of_another_environment_is_one_sentence(store):
     lines[3] = lines[3].replace('"action_dim": 1', '"action_dim": 2')
     index.write_text("\n".join(lines) + "\n")
 
-    with pytest.raises(ForbesError, match=r"line 4 is not .*\(its action_dim is not that of the episodes before\)"):
+    with pytest.raises(ForbesError, match=r"line 4 is not .*\(its action_dim is not that of the previous episodes\)"):
         EpisodeStore(store)
 
 

@@ -263,7 +263,7 @@ def test_an_empty_store_and_an_empty_split_are_one_sentence(tmp_path, path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ForbesError, match=r"empty: there are no episodes\. Collect some: forbes data collect --task"):
         Replay(str(tmp_path / "empty"))
-    with pytest.raises(ForbesError, match=r"no episode is of the split test, expected one of 10\. Collect more"):
+    with pytest.raises(ForbesError, match=r"the test split has no episodes, expected one out of 10\. Collect more"):
         next(iter(SequenceDataModule(Replay(str(path))).test_dataloader()))
 
 

@@ -82,7 +82,7 @@ class Kills(Said):
 def test_a_player_that_dies_each_time_is_named():
     with closing(EpisodeWorker(partial(Parrot, steps=8))) as player:
         player.begin(Kills(0.5), number=4, seed=0)
-        with pytest.raises(ForbesError, match="has died, exit code -9, 3 times in episode 4; what it said is above"):
+        with pytest.raises(ForbesError, match="died, exit code -9, 3 times in episode 4. Fix the error printed above"):
             player.finish()
 
 
@@ -95,7 +95,7 @@ def test_a_killed_player_is_started_again_and_plays_the_same_episode(capfd):
         for ours, theirs in zip(player.finish(), play(Parrot(8), Said(0.5)(None, 3), 3), strict=True):
             np.testing.assert_array_equal(ours, theirs)
 
-    assert "has died, exit code -9; episode 4 is played again" in capfd.readouterr().err
+    assert "died, exit code -9; episode 4 is replayed" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -80,7 +80,7 @@ def test_other_weights_and_a_missing_file_are_refused(tmp_path, monkeypatch):
     path = tmp_path / "classifiers.npz"
     monkeypatch.setattr(shipped, "classifiers_path", lambda: path)
 
-    with pytest.raises(ForbesError, match=r"classifiers\.npz: there is no such file\. Restore it"):
+    with pytest.raises(ForbesError, match=r"classifiers\.npz: no such file\. Restore it"):
         load_classifiers("bundled")
     np.savez(path, finished=np.zeros(3, np.float16))
     with pytest.raises(ForbesError, match=rf"weights of sha256 .*, expected {CLASSIFIERS_SHA256[:16]}"):

@@ -57,5 +57,5 @@ def test_the_bundled_digits_are_close_to_the_papers():
     assert measures["pixel IoU, mean"][0] >= 0.65
     assert measures["Chamfer distance in pixels, mean"][0] <= 0.25
     assert measures["order correlation, mean"][0] >= 0.8
-    ours, theirs = measures["points a digit, median"]
+    ours, theirs = measures["points per digit, median"]
     assert abs(ours / theirs - 1) <= 0.1

@@ -163,14 +163,14 @@ def test_the_last_training_digits_are_the_validation_split():
 def test_the_file_is_read_on_first_use_only(tmp_path):
     strokes = Strokes(path=str(tmp_path / "absent.npz"))
 
-    with pytest.raises(ForbesError, match=r"absent\.npz: there is no such file\. Rebuild it with: forbes data build"):
+    with pytest.raises(ForbesError, match=r"absent\.npz: no such file\. Rebuild it with: forbes data build"):
         strokes.size("train")
 
 
 def test_the_papers_set_is_looked_for_where_forbes_data_points(tmp_path, monkeypatch):
     monkeypatch.setenv("FORBES_DATA", str(tmp_path))
 
-    with pytest.raises(ForbesError, match="forbes data fetch strokes --from PATH, or use the origin bundled") as error:
+    with pytest.raises(ForbesError, match="forbes data fetch strokes --from PATH, or use the bundled origin") as error:
         Strokes("dejong").size("train")
 
     assert str(tmp_path / "dejong-strokes.npz") in str(error.value)
