@@ -1,4 +1,4 @@
-"""Completions of digits in pictures: what is drawn and its class, the scores, and the error of the best of n."""
+"""Figures of digit completions: drawings with their classes, scores, and the error of the best of n."""
 
 from collections.abc import Sequence
 from itertools import chain, cycle
@@ -24,23 +24,23 @@ from forbes.seeding import derive_seed
 __all__ = ["by_ambiguity", "drawings", "errors", "scores"]
 
 _SHOWN = 5
-"""Completions of each digit."""
+"""Number of completions drawn per digit."""
 _SIDE_BY_SIDE = 2
-"""Models; further ones are drawn below, beside the same digits."""
-_LEGEND = 5  # names in a line
-_SCORES = {  # of the class, with the rows that are no model's
+"""Number of models next to each other; further models are drawn below."""
+_LEGEND = 5  # entries per line
+_SCORES = {  # scores of the class, with the rows for comparison
     "js[end]": ("JS to the reference, nats", ("similar",)),
     "entropy[end]": ("entropy of the class, nats", ("similar", "reference")),
     "nll[end]": ("−log p of the label, nats", ("similar", "reference")),
-    "clear[end]": ("share of clear digits", ("similar", "truth")),
+    "clear[end]": ("fraction of clear digits", ("similar", "truth")),
 }
 _LINES = {"similar": ":", "reference": "--", "truth": "-."}
 
 
 def by_ambiguity(reference: Tensor, count: int) -> Tensor:
-    """Choose digits at equal distances in the order of their entropy under the reference, `(B, 10)`, the highest first.
+    """Return digits evenly spaced in decreasing order of their entropy under the reference, `(B, 10)`.
 
-    No model has a say in the choice; `(count,)`, int64, or fewer where there are fewer digits.
+    The choice does not depend on any model. The result is `(count,)`, int64, or fewer if there are fewer digits.
     """
     order = entropy(reference).argsort(descending=True, stable=True)  # (B,)
     return order[torch.linspace(0, len(order) - 1, min(count, len(order))).round().long()]
@@ -54,17 +54,17 @@ def drawings(
     place: Tensor,
     seed: int,
 ) -> Figure:
-    """Draw beginnings from the most to the least ambiguous, with completions and the classes that these show.
+    """Draw prefixes from the most to the least ambiguous, with completions and their class distribution.
 
-    Two models beside each other, further ones below.
+    Two models are drawn next to each other, further ones below.
 
     Args:
-        study: of one length of the prefix.
-        models: of its runs.
-        source: of the digits.
-        batch: the digits to draw, up to the end of the longest.
-        place: of them among the prefixes of the study, `(R,)`.
-        seed: of the completions.
+        study: results for one length of the prefix.
+        models: models of its runs.
+        source: source of the digits.
+        batch: digits to draw, up to the end of the longest.
+        place: position of each digit among the prefixes of the study, `(R,)`.
+        seed: random seed for the completions.
     """
     context, end = study.prefixes.context, study.prefixes.steps[place]  # (R,)
     digit = torch.arange(len(place))
@@ -91,7 +91,7 @@ def drawings(
 
 
 def scores(studies: Sequence[Study]) -> Figure:
-    """Draw scores of the class against the length of the beginning, with standard errors over digits."""
+    """Draw scores of the class against the length of the prefix, with standard errors over digits."""
     with paper_style():
         figure = Figure((PAGE, 2.1), layout="constrained")
         panels = figure.subplots(1, len(_SCORES))
@@ -118,7 +118,7 @@ def _draw_line(axes: Axes, studies: Sequence[Study], rows: Sequence[Row], score:
 
 
 def errors(studies: Sequence[Study]) -> Figure:
-    """Draw the error of the best of n completions (lines) and of their average picture (dashed) against n."""
+    """Draw the error of the best of n completions (solid) and of their average image (dashed) against n."""
     with paper_style():
         figure = Figure((PAGE, 2.3), layout="constrained")
         panels = figure.subplots(1, len(studies), squeeze=False, sharey=True)[0]

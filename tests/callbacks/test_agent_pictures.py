@@ -108,8 +108,8 @@ def test_the_panel_shows_truth_model_and_half_their_difference_around_grey(train
     figure = draw(PANEL, module, data)
 
     assert [axes.get_title() for axes in figure.axes] == [
-        "seen, and reconstructed",
-        "imagined under the true actions",
+        "observed and reconstructed",
+        "imagined for the true actions",
         "",
         "",
     ]
@@ -244,9 +244,9 @@ def test_a_curve_without_any_return_yet_is_empty():
         ("ImaginedFutures, init_args: {samples: 0}", "ImaginedFutures: samples is 0, expected at least 1"),
         ("ImaginedFutures, init_args: {context: 9}", "ImaginedFutures: context is 9, expected less than the length 5"),
         ("EpisodeVideo, init_args: {every: 0}", "EpisodeVideo: every is 0, expected at least 1"),
-        ("ReturnCurve, init_args: {reference: absent.json}", "absent.json: no such file of curves"),
+        ("ReturnCurve, init_args: {reference: absent.json}", "absent.json: no such file"),
         ("ReturnCurve, init_args: {reference: empty.json}", "empty.json: truncated or not JSON"),
-        ("ReturnCurve, init_args: {reference: other.json}", "other.json: has no curve of Slide, but of dmc_walk"),
+        ("ReturnCurve, init_args: {reference: other.json}", "other.json: has no curve for Slide, only for dmc_walk"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_before_the_training(callback, message, in_tmp_path, capsys):

@@ -88,14 +88,14 @@ def test_every_family_and_likelihood_is_drawn(arguments, tiny_config, callbacks,
 def test_a_model_without_a_state_has_no_belief_to_plot_and_all_the_rest(tiny_config, callbacks, tmp_path, capsys):
     flags = ["--config", str(tiny_config), "--model.model", "VectorModel", "--model.state_dim", "0"]
     assert main(["fit", *flags, "--config", str(callbacks), "--run_dir", str(tmp_path / "refused")]) == 2
-    assert "BeliefPlot: VectorModel has no state to plot. Leave this callback out" in capsys.readouterr().err
+    assert "BeliefPlot: VectorModel has no state to plot. Remove this callback" in capsys.readouterr().err
     assert not RunFolder(tmp_path / "refused").checkpoint.exists()
     run = tmp_path / "run"
     assert main(["fit", *flags, "--run_dir", str(run)]) == 0
 
     curves, grid = draw(ElboCurve(6), run), draw(PredictionGrid(3, 2, 3), run)
 
-    assert [axes.get_title() for axes in curves.axes] == ["log_p[bernoulli]", "loss of the roll-out"]
+    assert [axes.get_title() for axes in curves.axes] == ["log_p[bernoulli]", "rollout loss"]
     metrics = read_metrics(run)
     for axes, name in zip(curves.axes, ["log_p[bernoulli]", "overshoot"], strict=True):
         assert axes.lines[1].get_ydata() == pytest.approx(metrics[f"val/{name}"].dropna())

@@ -151,7 +151,7 @@ def test_a_planner_says_that_it_has_no_discrete_actions(tmp_path, capsys):
 
 def test_says_where_episodes_end_and_the_agent_imagines_that_none_does(tmp_path):
     parrot = ("--config", write_config(tmp_path), "--data.source.options", "{steps: 8, ends: true}")
-    with pytest.warns(UserWarning, match="Parrot: an episode has ended by itself.*--model.continuation true"):
+    with pytest.warns(UserWarning, match="Parrot: an episode terminated.*--model.continuation true"):
         assert fit(*parrot, "--run_dir", tmp_path / "blind") == 0
 
     assert fit(*parrot, "--model.continuation", "true", "--run_dir", tmp_path / "run") == 0
@@ -210,7 +210,7 @@ def test_an_environment_that_fails_for_good_ends_the_training_and_loses_nothing(
     assert fit("--config", write_config(tmp_path), *task, "--run_dir", tmp_path / "run") == 2
 
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "so broke episode 3 3 times, nothing of it is stored. Mend the environment" in error
+    assert "episode 3 failed 3 times and was not stored. Fix the environment" in error
     assert list(EpisodeStore(tmp_path / "run" / "episodes").records) == [0, 1, 2]
     assert fit("--resume", tmp_path / "run") == 0
     assert list(EpisodeStore(tmp_path / "run" / "episodes").records) == [0, 1, 2, 3]
@@ -252,7 +252,7 @@ def test_a_disk_that_is_full_ends_the_training_and_loses_nothing(run, tmp_path, 
         patch.setattr(os, "fsync", full)
         assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run") == 2
 
-    sentence = "000003.npz: cannot be written (No space left on device). Make room, or choose another place"
+    sentence = "000003.npz: cannot be written (No space left on device). Free some space, or choose another folder"
     assert capsys.readouterr().err.splitlines()[-1].endswith(sentence)
     assert fit("--resume", tmp_path / "run") == 0
     pd.testing.assert_frame_equal(read_metrics(tmp_path / "run"), read_metrics(run), check_exact=True)

@@ -72,7 +72,7 @@ def test_replay_names_the_first_tensor_that_is_not_finite(diverged, capsys):
     assert main(["replay", str(run.failure)]) == 0
 
     said = capsys.readouterr().out
-    assert said.startswith(f"{run.failure}: update 12, computed again on cpu: the first tensor that is not finite is ")
+    assert said.startswith(f"{run.failure}: update 12, recomputed on cpu: the first tensor that is not finite is ")
     name, kind = re.search(r"is the output of ([\w.]+) \((\w+)\): \d+ of \d+ values, shape \(", said).groups()
     module, _ = load_run(run.path)
     assert type(part := module.get_submodule(name)).__name__ == kind
@@ -111,7 +111,7 @@ def test_replay_says_so_where_the_update_is_finite_now(tiny_config, tmp_path, mo
 
     assert main(["replay", str(run.failure)]) == 2
 
-    assert "update 4, computed again on cpu, is finite; it was not on cpu" in capsys.readouterr().err
+    assert "update 4, recomputed on cpu, is finite; it was not on cpu" in capsys.readouterr().err
 
 
 def test_replay_repeats_noise_batches_and_weight_of_the_kl(tiny_config, tmp_path, monkeypatch):
@@ -154,7 +154,7 @@ def test_replay_of_no_file_is_one_sentence(tiny_run, capsys):
     [
         ({"update": None}, "its update is NoneType, expected the failure.pt of a run that diverged"),
         ({"batches": [{}]}, "one of its batches lacks a field"),
-        ({"batches": []}, "it has not a number for each batch"),
+        ({"batches": []}, "it does not have one number per batch"),
         ({"state_dict": {}}, "it has no model."),
     ],
 )
@@ -191,7 +191,7 @@ def test_a_lower_rate_goes_on_from_the_checkpoint_and_is_recorded(tiny_run, tmp_
     assert main(["fit", "--resume", str(run), *flags, *LOWER_RATE]) == 0
 
     said = capsys.readouterr().err
-    assert [f"goes on from update 10 with learning_rate {rate}" in said for rate in (0.5, 0.25)] == [True, True]
+    assert [f"continues from update 10 with learning_rate {rate}" in said for rate in (0.5, 0.25)] == [True, True]
     lines = [json.loads(line) for line in run.metrics.read_text().splitlines()]
     noted = [line for line in lines if "divergence/update" in line]
     assert noted == [{"update": 10, "divergence/update": 13, "divergence/learning_rate": rate} for rate in (0.5, 0.25)]

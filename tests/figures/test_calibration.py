@@ -89,7 +89,7 @@ def test_it_says_what_is_drawn(figure, tmp_path):
     assert labels == [
         ("rank of the true value / L", "density of ranks"),
         ("rank of the true value / L", "ECDF − uniform"),
-        ("nominal level of the region", "true values within"),
+        ("nominal level of the region", "true values inside"),
     ]
     assert [text.get_text() for text in legend.get_texts()] == ["exact", "narrow", "calibrated, 95 %"]
     save_figure(figure, tmp_path / "calibration.pdf")

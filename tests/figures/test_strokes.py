@@ -100,7 +100,7 @@ def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [
         "FORBES, 2 runs",
         "RSSM",
-        "test, at the end",
+        "final test",
     ]
 
 
