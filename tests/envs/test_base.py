@@ -64,14 +64,14 @@ class Sound(Environment):
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("observation_shape", None, "observation_shape is None, expected (C, H, W) or (O,). Give the class one"),
+        ("observation_shape", None, "observation_shape is None, expected (C, H, W) or (O,). Set it in the class"),
         ("observation_shape", (8, 8), "observation_shape is (8, 8), expected"),
         ("observation_shape", 4, "observation_shape is 4, expected"),
-        ("action_dim", 0, "action_dim is 0, expected a whole number above 0"),
+        ("action_dim", 0, "action_dim is 0, expected an integer above 0"),
         ("action_dim", 1.5, "action_dim is 1.5, expected"),
         ("action_repeat", None, "action_repeat is None, expected"),
         ("discrete", 1, "discrete is 1, expected true or false"),
-        ("describe", dict, "describe() gives {}, expected a task among it"),
+        ("describe", dict, "describe() returns {}, expected a task"),
     ],
 )
 def test_what_an_environment_must_say_is_checked(name, value, sentence):
@@ -85,5 +85,5 @@ def test_what_an_environment_must_say_is_checked(name, value, sentence):
 
 
 def test_what_is_no_step_is_named():
-    with pytest.raises(ValueError, match="it gives a tuple, expected a Step"):
+    with pytest.raises(ValueError, match="it returns a tuple, expected a Step"):
         check_step((SEEN, 0.0), SEEN.shape)

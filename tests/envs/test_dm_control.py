@@ -118,11 +118,11 @@ def test_a_pole_thinner_than_a_pixel_is_in_a_fast_frame(backend, seed):
     [
         (("cartpole_swingp",), "cartpole_swingp: no such task. Did you mean cartpole_swingup"),
         (("walker_wlak",), "Did you mean walker_walk"),
-        (("qqq",), "qqq: no such task. `forbes data collect --help` says what there is"),
+        (("qqq",), "qqq: no such task. `forbes data collect --help` lists the tasks"),
         (("cartpole_swingup", False, 0), "cartpole_swingup: action_repeat is 0, expected at least 1"),
         (
             ("lqr_lqr_2_1",),
-            "lqr_lqr_2_1: its actions have no bounds that [-1, 1] could be scaled to.",
+            "lqr_lqr_2_1: its actions are unbounded, so [-1, 1] cannot be scaled to them.",
         ),
     ],
 )

@@ -318,7 +318,10 @@ def test_a_space_that_is_no_array_is_refused_by_name(space, sentence, monkeypatc
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"pixels": True}, "it draws no pictures (render_mode rgb_array), expected them for pixels. Leave pixels out"),
+        (
+            {"pixels": True},
+            "it does not render images (render_mode rgb_array), as needed for pixels. Do not set pixels",
+        ),
         ({"part": "image"}, "part is 'image', expected one of a Dict"),
     ],
 )

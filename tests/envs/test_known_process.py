@@ -118,14 +118,14 @@ def test_half_an_action_is_half_a_step():
 def test_a_process_without_rewards_is_one_sentence():
     environment = KnownProcess(MirrorSensor(cells=401))
     environment.reset(0)
-    with pytest.raises(ForbesError, match=r"^MirrorSensor: has no rewards, expected a process that gives them"):
+    with pytest.raises(ForbesError, match=r"^MirrorSensor: has no rewards, expected a process with rewards"):
         environment.step(np.zeros(0, np.float32))
 
 
 def test_names_that_are_nearly_right_are_suggested():
     with pytest.raises(ForbesError, match=r"^mountain_hik: no such task\. Did you mean mountain_hike\?$"):
         find_environment("mountain_hik")
-    with pytest.raises(ForbesError, match=r"^tiger: its environment has no option camera\. Leave it out$"):
+    with pytest.raises(ForbesError, match=r"^tiger: its environment has no option camera\. Remove it$"):
         find_environment("tiger", camera=1)
 
 
@@ -157,7 +157,7 @@ def test_with_the_exact_belief_an_episode_is_the_same_and_its_belief_is_shown(ta
 
 
 def test_refuses_to_show_a_belief_of_too_many_numbers():
-    with pytest.raises(ForbesError, match="shows: the exact belief is a GridBelief of too many numbers"):
+    with pytest.raises(ForbesError, match="shows: the exact belief is a GridBelief with too many parameters"):
         KnownProcess(MirrorSensor(), shows="exact_belief")
 
 

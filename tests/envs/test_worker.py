@@ -63,8 +63,8 @@ def test_no_episode_is_without_a_limit_of_steps(echo):
 SENTENCES = {
     "raises": "step raises ArithmeticError: the physics has exploded",
     "hangs": "it hangs, no answer to step within 2 s",
-    "dies": "its process has died in step, exit code -9",
-    "leaves": "its process has died in step, exit code 7",
+    "dies": "its process died in step, exit code -9",
+    "leaves": "its process died in step, exit code 7",
     "rewards_nan": "step raises ValueError: the reward is nan, expected a finite number",
     "sees_nan": "step raises ValueError: the observation is not finite",
     "sees_another_shape": "the observation is float32 (3,), expected float32 (2,)",
@@ -100,7 +100,7 @@ def test_trouble_before_the_first_step_is_a_sentence_and_leaves_no_process(where
     sentences = {
         "raises": f"{where} raises ArithmeticError: the physics has exploded",
         "hangs": f"it hangs, no answer to {where} within 3 s",
-        "leaves": f"its process has died in {where}, exit code 7",
+        "leaves": f"its process died in {where}, exit code 7",
     }
     assert str(error.value).startswith(f"{'Unready' if where == 'start' else 'Echo'}: {sentences[trouble]}")
     assert set(multiprocessing.active_children()) <= begun
@@ -133,7 +133,7 @@ def test_a_signal_to_a_process_that_starts_is_left_to_its_parent(number, monkeyp
 def test_a_process_that_dies_before_or_within_its_answer_has_died(sent, tmp_path):
     """A connection tells the two apart: by an EOFError and an OSError."""
     with EnvironmentProcess(partial(Severed, sent)) as environment:
-        with pytest.raises(BrokenEnvironmentError, match="Echo: its process has died in reset, exit code 7"):
+        with pytest.raises(BrokenEnvironmentError, match="Echo: its process died in reset, exit code 7"):
             environment.reset(0)
 
 
@@ -227,7 +227,7 @@ NAMES = ("Room", "Room", "furnish")
 
 def assert_told_to_move(name, sentence):
     assert sentence.startswith(f"{name}: it is defined in a notebook or on standard input, which")
-    assert sentence.endswith("Define it at the top of a module file, and import it from there")
+    assert sentence.endswith("Define it at the top level of a module file, and import it from there")
 
 
 def run_notebook(*flags, stdin=None):
@@ -252,8 +252,8 @@ def test_a_script_on_standard_input_is_told_to_move_to_a_file():
     for name, sentence in zip(NAMES, done.stdout.splitlines(), strict=True):
         assert_told_to_move(name, sentence)
     assert done.stderr.splitlines()[-1].endswith(
-        "Echo: commands on standard input cannot start the process of an environment, which reads them again. "
-        "Write them to a file"
+        "Echo: code on standard input cannot start the worker process of an environment, which re-imports it. "
+        "Write it to a file"
     )
 
 
@@ -263,6 +263,6 @@ def test_what_cannot_be_sent_to_another_process_is_one_sentence():
 
     for make in (Local, lambda: Echo()):
         with pytest.raises(
-            ForbesError, match=r"it cannot be sent to another process .* Define it at the top of a module"
+            ForbesError, match=r"it cannot be sent to another process .* Define it at the top level of a module"
         ):
             EnvironmentProcess(make)
