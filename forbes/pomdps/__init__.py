@@ -1,4 +1,4 @@
-"""Partially observable processes whose belief is known exactly, one file each, all through `Process`."""
+"""Partially observable processes with an exactly known belief, one file each, with the interface `Process`."""
 
 from forbes.pomdps.base import AffineGaussian, ExactFilter, Process, Trajectories
 from forbes.pomdps.beliefs import CategoricalBelief, ExactBelief, GaussianMixtureBelief, GridBelief

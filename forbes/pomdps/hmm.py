@@ -11,15 +11,15 @@ __all__ = ["FiniteProcess"]
 
 
 class FiniteProcess(Process):
-    r"""A hidden Markov model with actions, given by its tables. States, observations and actions are one-hot.
+    r"""A hidden Markov model with actions, defined by tables. States, observations and actions are one-hot.
 
     .. math:: \pi_t(s') = \sum_s T_a(s, s')\, b_{t-1}(s), \qquad p(o \mid o_{<t}) = \sum_{s'} O(s', o)\, \pi_t(s'),
               \qquad b_t(s') = \frac{O(s', o)\, \pi_t(s')}{p(o \mid o_{<t})}
 
     Args:
-        initial: probability of each state at the start, `(S,)` in float64.
-        transition: :math:`T_a(s, s')`, `(A, S, S)`.
-        emission: :math:`O(s, o)`, `(S, O)`.
+        initial: initial probability of each state, `(S,)` in float64.
+        transition: transition probabilities :math:`T_a(s, s')`, `(A, S, S)`.
+        emission: emission probabilities :math:`O(s, o)`, `(S, O)`.
         policy: probability of each action in `sample`, independent over time, `(A,)`.
     """
 
@@ -44,22 +44,23 @@ class FiniteProcess(Process):
 
     def policy(self, sequences: int, steps: int, generator: torch.Generator) -> Tensor:
         """See `Process.policy`."""
-        each = CategoricalBelief(self.policy_table.log())
-        return each.sample(sequences * steps, generator).view(sequences, steps, -1)  # (B, steps, A)
+        action = CategoricalBelief(self.policy_table.log())
+        return action.sample(sequences * steps, generator).view(sequences, steps, -1)  # (B, steps, A)
 
     def exact_filter(self, observation: Tensor, action: Tensor) -> ExactFilter:
-        """See `Process.exact_filter`; an observation that cannot occur is an error."""
+        """See `Process.exact_filter`; observations of probability 0 are an error."""
         observation, action = self.checked(observation, action)
         self._require_one_hot("observation", observation, first=0)
         self._require_one_hot("action", action, first=1)
-        number = action.argmax(-1)  # (B, T)
+        action_index = action.argmax(-1)  # (B, T)
         likelihood = (observation @ self.emission_table.T).unbind(1)  # T x (B, S)
         predicted = self.initial_table.expand(len(observation), -1)  # (B, S)
         masses: list[Tensor] = []
         evidences: list[Tensor] = []
         for time, seen in enumerate(likelihood):
             if time > 0:
-                predicted = (masses[-1].unsqueeze(1) @ self.transition_table[number[:, time]]).squeeze(1)  # (B, S)
+                transition = self.transition_table[action_index[:, time]]  # (B, S, S)
+                predicted = (masses[-1].unsqueeze(1) @ transition).squeeze(1)  # (B, S)
             joint = predicted * seen
             evidences.append(joint.sum(-1))  # (B,)
             masses.append(joint / evidences[-1].unsqueeze(-1))
@@ -67,8 +68,8 @@ class FiniteProcess(Process):
         if len(impossible := torch.nonzero(~(evidence > 0))):
             sequence, step = impossible[0].tolist()
             raise ForbesError(
-                f"{type(self).__name__}: sequence {sequence} has probability 0 from step {step} on, expected what the "
-                "process can produce. Compare the parameters with those that made the data"
+                f"{type(self).__name__}: sequence {sequence} has probability 0 from step {step} on, expected a "
+                "possible sequence. Compare the parameters with those that generated the data"
             )
         return ExactFilter(CategoricalBelief(torch.stack(masses, 1).log()), evidence.log())  # (B, T, S), (B, T)
 
@@ -78,5 +79,5 @@ class FiniteProcess(Process):
             sequence, step = wrong[0].tolist()
             raise ForbesError(
                 f"{type(self).__name__}: the {name} of sequence {sequence} at step {step + first} is not one-hot, "
-                f"expected one 1 among {values.shape[-1]} numbers and 0 elsewhere. Encode it so"
+                f"expected one 1 among {values.shape[-1]} values and 0 elsewhere. Encode it as one-hot"
             )
