@@ -1,4 +1,4 @@
-"""Stateless randomness: a stream is a pure function of (seed, purpose, counter); resuming needs no RNG state."""
+"""Stateless randomness: a stream is a pure function of (seed, purpose, counter), so resuming needs no RNG state."""
 
 import hashlib
 
@@ -14,5 +14,5 @@ def derive_seed(seed: int, purpose: str, counter: int) -> int:
 
 
 def generator(seed: int, purpose: str, counter: int) -> torch.Generator:
-    """Return a CPU generator that depends on (seed, purpose, counter) only."""
+    """Return a CPU generator that depends only on (seed, purpose, counter)."""
     return torch.Generator().manual_seed(derive_seed(seed, purpose, counter))

@@ -43,7 +43,7 @@ def test_a_run_with_a_link_is_not_resumed(run, precious, capsys, name):
 
     assert main(["fit", "--resume", str(run), "--trainer.max_epochs", "3"]) == 2
 
-    assert f"{run / name}: is a symbolic link, expected what it names itself" in capsys.readouterr().err
+    assert f"{run / name}: is a symbolic link, expected a file or folder" in capsys.readouterr().err
     assert precious.read_bytes() == content
 
 

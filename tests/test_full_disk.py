@@ -143,7 +143,11 @@ def test_a_store_whose_index_is_full_has_whole_episodes_and_takes_more_later(tmp
     assert len(EpisodeStore(tmp_path).records) == len(stored.records) + 1
 
 
-REMEDIES = {errno.ENOSPC: "Make room, or", errno.EDQUOT: "Make room in your quota", errno.EFBIG: "Allow larger files"}
+REMEDIES = {
+    errno.ENOSPC: "Free some space, or",
+    errno.EDQUOT: "Free some space in your quota",
+    errno.EFBIG: "Allow larger files",
+}
 
 
 @pytest.mark.parametrize("number", REMEDIES)
@@ -171,7 +175,8 @@ def test_a_full_disk_that_another_library_meets_is_one_sentence(monkeypatch, cap
         monkeypatch.setattr("forbes.commands.doctor.main", full)
         assert main(["doctor"]) == 2
         assert (
-            capsys.readouterr().err == f"forbes: {said} (No space left on device). Make room, or choose another place\n"
+            capsys.readouterr().err
+            == f"forbes: {said} (No space left on device). Free some space, or choose another folder\n"
         )
 
 
@@ -194,7 +199,7 @@ def test_a_training_on_a_full_disk_names_the_file_and_goes_on_when_there_is_room
 
     *_, said = capsys.readouterr().err.splitlines()
     assert said.startswith(f"forbes: {tmp_path / 'run'}/")
-    assert said.endswith("cannot be written (No space left on device). Make room, or choose another place")
+    assert said.endswith("cannot be written (No space left on device). Free some space, or choose another folder")
     first = calls[when - 1]
     name = os.path.basename(first).removeprefix(".").rpartition(".")[0] if "." in os.path.basename(first) else ""
     assert name in said
@@ -252,7 +257,8 @@ def test_a_disk_that_is_really_full_loses_nothing_and_is_named(tmp_path):
     said = json.loads(done.stdout)
     assert len(said) == 3
     assert all(
-        "cannot be written (No space left on device). Make room, or choose another place" in each for each in said
+        "cannot be written (No space left on device). Free some space, or choose another folder" in each
+        for each in said
     )
     assert [part in each for part, each in zip(("/store/", "/metrics.jsonl", "/last.ckpt"), said, strict=True)] == [
         True
@@ -310,7 +316,7 @@ def test_collecting_more_episodes_than_fit_is_said_when_the_first_is_there(count
     with free(monkeypatch, 16.5 * size), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert forbes(*command, count) == 0
-    assert any("the episodes to come will take about" in str(each.message) for each in caught) == warns
+    assert any("the remaining episodes will take about" in str(each.message) for each in caught) == warns
 
 
 @pytest.mark.parametrize(("capacity", "more"), [(1000, 2), (24, 1), (16, 0)])

@@ -1,4 +1,4 @@
-"""Errors of the configuration, from jsonargparse's pages to one sentence that names the nearest valid word."""
+"""Errors of the configuration: turn jsonargparse's messages into one sentence with the nearest valid name."""
 
 import argparse
 import difflib
@@ -21,7 +21,7 @@ from forbes.reading import shortened
 
 __all__ = ["building", "one_sentence", "raised_inside", "said_by_lightning"]
 
-_LENGTH = 200  # characters of a sentence without its place; some of the libraries print a whole configuration
+_LENGTH = 200  # characters of a message; the libraries' own may contain a whole configuration
 
 TOP_LEVEL = ("model", "data", "trainer", "seed_everything", "config", "ckpt_path")
 SECTIONS = {"data.source": SequenceSource, "data": SequenceDataModule, "trainer": Trainer, "model": LightningModule}
@@ -29,15 +29,15 @@ CONFIGURABLE = (nn.Module, LightningDataModule, SequenceSource, Callback, Logger
 
 
 def one_sentence(message: str, arguments: Sequence[str] = ()) -> str:
-    """Say where a configuration is wrong, and what to write instead.
+    """Return one sentence that says where a configuration is wrong, and what to write instead.
 
     Args:
-        message: what jsonargparse says, many lines with the way through the nested types.
-        arguments: of the command line, to tell a flag from a line of the file.
+        message: message of jsonargparse, with many lines about nested types.
+        arguments: command line, to distinguish a wrong flag from a wrong line in a file.
     """
     keys = re.findall(r'Parser key "([\w.]+)"', message)
     if found := re.search(r"unrecognized arguments: (\S+\.ya?ml)\b", message):
-        return f"{found[1]}: a configuration needs its flag. Say: --config {found[1]}"
+        return f"{found[1]}: a configuration needs its flag. Write: --config {found[1]}"
     if found := re.search(r"[Oo]ption '([\w.]+)'|unrecognized arguments: --([\w.]+)", message):
         key, sentence = _unknown_option(message, keys, found[1] or found[2])
     elif found := re.search(r"Expected a dot import path string: (\S*)|has no attribute '(\w+)'", message):
@@ -49,27 +49,27 @@ def one_sentence(message: str, arguments: Sequence[str] = ()) -> str:
     elif found := re.search(r"arguments are required: ([\w., ]+)", message):
         key, sentence = ".".join(keys), f"{found[1]} missing, {_supply('.'.join(keys), found[1])}"
     elif found := re.search(r"File does not exist: '(.*)'", message):
-        return f"{found[1]}: no such file. See configs/ for those that come with forbes"
+        return f"{found[1]}: no such file. The configurations of forbes are in configs/"
     else:
         key, sentence = ".".join(keys), _wrong_value(message)
     return f"{_place(key, arguments)}{key + ': ' if key else ''}{shortened(sentence, _LENGTH)}"
 
 
 def _supply(key: str, missing: str) -> str:
-    """Say how to give what is missing: of a class, or of the whole configuration."""
+    """Return how to supply a missing argument of a class, or the whole configuration."""
     if not key:
         return "give a configuration: --config configs/strokes/forbes.yaml"
     return f"give it: --{key}.{missing} VALUE"
 
 
 def _unknown_option(message: str, keys: list[str], option: str) -> tuple[str, str]:
-    """Name an option that a class, the trainer or the whole configuration does not have."""
+    """Return key and sentence for an option that a class, the trainer or the configuration does not have."""
     if group := re.search(r"Group '(\w+)'", message):
         keys = [group[1], *keys]
     path = [*keys, *option.removesuffix(".class_path").split(".")]
     owners = re.findall(r"class_path[= ]'([\w.]+)'", message)
-    if owners and pydoc.locate(owners[-1]) is None:  # a short name, which jsonargparse took for one of the arguments
-        return ".".join(keys), f"{owners[-1]}: expected init_args beside class_path, found {option.split('.')[0]}"
+    if owners and pydoc.locate(owners[-1]) is None:  # a short name, with arguments that are not in init_args
+        return ".".join(keys), f"{owners[-1]}: expected init_args next to class_path, found {option.split('.')[0]}"
     if owners:
         owner, valid = owners[-1].rpartition(".")[2], list(inspect.signature(pydoc.locate(owners[-1])).parameters)  # type: ignore[arg-type]
     elif path[0] == "trainer":
@@ -80,7 +80,7 @@ def _unknown_option(message: str, keys: list[str], option: str) -> tuple[str, st
 
 
 def _nearest_of_all(option: str) -> str:
-    """Suggest the option of the whole configuration whose last word is the nearest."""
+    """Suggest the nearest option of the whole configuration, by its last part."""
     places = {name: f"{section}.{name}" for section, kind in SECTIONS.items() for name in _arguments(kind)}
     places |= {name: name for name in TOP_LEVEL}
     near = difflib.get_close_matches(option, places, n=1)
@@ -88,24 +88,24 @@ def _nearest_of_all(option: str) -> str:
 
 
 def _arguments(kind: type) -> set[str]:
-    """Return the arguments of a class and of all of ours that derive from it."""
-    ours = [each for each in _derived([kind]) if each is kind or each.__module__.startswith("forbes.")]
-    return {name for each in ours for name in inspect.signature(each).parameters}
+    """Return the arguments of a class and of its subclasses in forbes."""
+    ours = [derived for derived in _derived([kind]) if derived is kind or derived.__module__.startswith("forbes.")]
+    return {name for derived in ours for name in inspect.signature(derived).parameters}
 
 
 def _unknown_class(name: str) -> str:
-    """Name a class that does not exist, or exists and is of another kind."""
+    """Return the sentence for a class that does not exist, or has the wrong type."""
     return f"no class {name} that fits here{_nearest(name, sorted(_class_names() - {name}))}"
 
 
 def _class_names() -> set[str]:
-    """Return the names of the classes a configuration may name."""
+    """Return the names of the classes that a configuration may use."""
     found = _derived(CONFIGURABLE)
     return {kind.__name__ for kind in found if kind.__module__.split(".")[0] != "torch" and kind.__name__[0] != "_"}
 
 
 def _derived(kinds: Sequence[type]) -> set[type]:
-    """Return classes with all that derive from them."""
+    """Return classes and all their subclasses."""
     found: set[type] = set()
     pending = list(kinds)
     while pending:
@@ -117,7 +117,7 @@ def _derived(kinds: Sequence[type]) -> set[type]:
 
 
 def _nearest(word: str, valid: Sequence[str]) -> str:
-    """Suggest the nearest valid word, or give a short list whole."""
+    """Suggest the nearest valid name, or list all names if there are at most ten."""
     near = difflib.get_close_matches(word, valid, n=1)
     if near:
         return f", did you mean {near[0]}?"
@@ -125,7 +125,7 @@ def _nearest(word: str, valid: Sequence[str]) -> str:
 
 
 def _wrong_value(message: str) -> str:
-    """Say which value was given and what was expected; keep the library's words where they are short already."""
+    """Return the given and the expected value; keep other messages of the library as they are."""
     expected = re.search(r"Expected a (.+?)\. Got value: ([^\n]+?)(?:\. Got value|\n|$)", message)
     if expected is None and "Subtypes" in message:
         expected = re.search(r"Subtypes: \[(.+?)\]\n.*Given value: ([^\n]*)", message, re.DOTALL)
@@ -136,7 +136,7 @@ def _wrong_value(message: str) -> str:
 
 
 def _place(key: str, arguments: Sequence[str]) -> str:
-    """Name the configuration file, unless a flag is to blame."""
+    """Return the configuration file of a wrong key, or nothing if a flag is wrong."""
     flags = [argument.split("=")[0].replace(".init_args", "") for argument in arguments if argument.startswith("--")]
     if key and f"--{key}" in flags:
         return ""
@@ -149,7 +149,7 @@ def _place(key: str, arguments: Sequence[str]) -> str:
 
 
 def raised_inside(error: BaseException) -> ForbesError | None:
-    """Find the error of ours that a constructor has raised, under what jsonargparse makes of it."""
+    """Return the `ForbesError` in the chain of causes of an error that jsonargparse raises, if there is one."""
     inner: BaseException | None = error
     while inner is not None and not isinstance(inner, ForbesError):
         inner = inner.__cause__
@@ -158,28 +158,28 @@ def raised_inside(error: BaseException) -> ForbesError | None:
 
 @contextmanager
 def building(where: str) -> Iterator[None]:
-    """Turn an error inside a class that a configuration names into one sentence.
+    """Turn an error in the constructor of a configured class into one sentence.
 
     Args:
-        where: the configuration's name.
+        where: name of the configuration.
 
     Raises:
-        ForbesError: what the class or Lightning has said, or which error it has raised.
+        ForbesError: with the message of the class or of Lightning, or the type of the error.
     """
     try:
         yield
-    except (argparse.ArgumentError, OSError):  # said elsewhere
+    except (argparse.ArgumentError, OSError):  # handled by the caller
         raise
     except Exception as error:
         if inner := raised_inside(error):
             raise inner from None
         cause = f"{type(error).__name__}: {shortened(str(error), 120)}"
-        said = said_by_lightning(error) or f"{where}: what it names cannot be built ({cause}). Change it; see --debug"
+        said = said_by_lightning(error) or f"{where}: cannot be instantiated ({cause}). Change it; see --debug"
         raise ForbesError(said) from error
 
 
 def said_by_lightning(error: BaseException) -> str | None:
-    """Return the message of an error that Lightning itself has raised, as it does where it is misused; else None."""
+    """Return the message of an error that was raised by Lightning itself because of wrong usage, else None."""
     while error.__cause__ is not None:
         error = error.__cause__
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
