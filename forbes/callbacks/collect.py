@@ -131,7 +131,7 @@ class Collect(Callback):
     @staticmethod
     def _predict_rewards(agent: WorldModelAgent, episode: Episode, number: int) -> Tensor:
         seed = derive_seed(agent.seed, "foresight", number)
-        return predict_rewards(agent, episode, seed, f"evaluation episode {number}", (_AHEAD,))[0]
+        return predict_rewards(agent, episode, seed, f"evaluation episode {number}", (_AHEAD,))[_AHEAD]
 
     def evaluation_episode(self, trainer: Trainer, agent: WorldModelAgent, number: int) -> Episode:
         """Play evaluation episode `number`, the same every time, with the agent in eval mode."""

@@ -40,10 +40,11 @@ def print_agents(played: Sequence[PlayedAgent]) -> None:
 def _reward_prediction(played: Sequence[PlayedAgent]) -> Table:
     title = "R² of the rewards in these episodes, predicted by the world model for the actions taken"
     table = Table("run", title=f"{title}; 0 is no better than the mean reward")
-    for distance in STEPS_AHEAD:
-        table.add_column(f"{distance} steps ahead" if distance else "current step", justify="right")
+    for ahead in STEPS_AHEAD:
+        table.add_column(f"{ahead} steps ahead" if ahead else "current step", justify="right")
     for one in played:
-        table.add_row(escape(one.run), *("n/a" if share is None else str(share) for share in one.explained))
+        r2_scores = (one.r2[ahead] for ahead in STEPS_AHEAD)
+        table.add_row(escape(one.run), *("n/a" if r2 is None else str(r2) for r2 in r2_scores))
     return table
 
 

@@ -18,7 +18,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.agent_beliefs import exact_variance, learned_variance, prior_and_posterior, uncertainty
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.record import require_readable, write_record
-from forbes.evaluation.reward_prediction import SAMPLES, STEPS_AHEAD, explained, predict_rewards
+from forbes.evaluation.reward_prediction import SAMPLES, predict_rewards, r2_by_steps_ahead
 from forbes.pomdps import Process
 from forbes.runs.provenance import commit
 from forbes.seeding import derive_seed
@@ -33,6 +33,21 @@ _APART = ("made_by", "shows", "observation_shape")
 """Fields in which environments of one task may differ: the rewards do not depend on what the agent is shown."""
 
 
+class EpisodeMeasures(NamedTuple):
+    """What is measured in one test episode of T actions."""
+
+    total_reward: float
+    """Undiscounted return."""
+    reward: Tensor
+    """Observed rewards, `(T,)`, float64."""
+    predicted: dict[int, Tensor]
+    """Predicted rewards by steps ahead, from `predict_rewards`."""
+    distance: Tensor | None
+    """KL of prior and posterior from a Gaussian, `(2,)`; None if s is discrete."""
+    variances: tuple[Tensor, Tensor] | None
+    """Variance of each reward under the learned and the exact belief, `(T,)` each; None if no exact belief is known."""
+
+
 class PlayedAgent(NamedTuple):
     """A run and its results in the test episodes."""
 
@@ -40,8 +55,8 @@ class PlayedAgent(NamedTuple):
     agent: WorldModelAgent
     returns: Tensor
     """Undiscounted return of each episode, `(E,)`, float64."""
-    explained: list[Estimate | None]
-    """R² of the predicted rewards, for each of `STEPS_AHEAD`."""
+    r2: dict[int, Estimate | None]
+    """R² of the predicted rewards by steps ahead."""
     belief: dict[str, Estimate]
     """Metrics of the belief: `DISTANCES` from a Gaussian if s is continuous, `REWARD` if the exact belief is known."""
     environment: dict[str, Any]
@@ -92,26 +107,37 @@ def evaluate_agents(
 def _play(
     run: str, agent: WorldModelAgent, environment: EnvironmentProcess, checkpoint: str, episodes: int, seed: int
 ) -> PlayedAgent:
-    returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
-    process, variances, distances = _known_process(environment), list[tuple[Tensor, Tensor]](), list[Tensor]()
+    process = _known_process(environment)
+    measured: list[EpisodeMeasures] = []
     for number in _counted(run, episodes):
         episode = play_test_episode(agent, environment, seed, number)
-        returns.append(episode.total_reward)
-        rewards.append(torch.from_numpy(episode.reward[1:]).double())  # (T,)
-        draws = derive_seed(seed, "foresight", number)
-        foretold.append(predict_rewards(agent, episode, draws, f"{run}, test episode {number}"))
-        if (distance := prior_and_posterior(agent, episode, draws)) is not None:
-            distances.append(distance)
-        if process is not None:
-            variances.append((learned_variance(agent, episode, draws), exact_variance(process, episode, draws)))
-    total = torch.tensor(returns, dtype=torch.float64)  # (E,)
-    belief = dict[str, Estimate]()
+        name, of_samples = f"{run}, test episode {number}", derive_seed(seed, "foresight", number)
+        measured.append(_measure(agent, episode, process, of_samples, name))
+    returns = torch.tensor([episode.total_reward for episode in measured], dtype=torch.float64)  # (E,)
+    r2 = r2_by_steps_ahead([episode.predicted for episode in measured], [episode.reward for episode in measured])
+    distances = [episode.distance for episode in measured if episode.distance is not None]  # E x (2,), or none
+    variances = [episode.variances for episode in measured if episode.variances is not None]  # E x 2 x (T,), or none
+    belief: dict[str, Estimate] = {}
     if distances:
         belief |= zip(DISTANCES, map(Estimate.of, torch.stack(distances, 1)), strict=True)  # 2 x (E,)
     if variances:
         belief[REWARD] = uncertainty(*zip(*variances, strict=True))
-    return PlayedAgent(
-        run, agent, total, explained(foretold, rewards), belief, describe_environment(environment), checkpoint
+    return PlayedAgent(run, agent, returns, r2, belief, describe_environment(environment), checkpoint)
+
+
+def _measure(
+    agent: WorldModelAgent, episode: Episode, process: Process | None, seed: int, name: str
+) -> EpisodeMeasures:
+    """Measure one episode; `seed` is the random seed for samples of the beliefs, `name` is for error messages."""
+    variances = None
+    if process is not None:
+        variances = learned_variance(agent, episode, seed), exact_variance(process, episode, seed)
+    return EpisodeMeasures(
+        total_reward=episode.total_reward,
+        reward=torch.from_numpy(episode.reward[1:]).double(),
+        predicted=predict_rewards(agent, episode, seed, name),
+        distance=prior_and_posterior(agent, episode, seed),
+        variances=variances,
     )
 
 
@@ -139,14 +165,14 @@ def _record(one: PlayedAgent, folder: Path, seed: int, command: str) -> None:
     }
     samples = one.agent.acting_samples
     tag = f"episodes={len(one.returns)}{'' if samples == 1 else f',K={samples}'}"
-    shares = {
-        f"reward_explained[ahead={distance},S={SAMPLES},{tag}]": share._asdict() | measured
-        for distance, share in zip(STEPS_AHEAD, one.explained, strict=True)
-        if share is not None
+    others = {
+        f"reward_explained[ahead={ahead},S={SAMPLES},{tag}]": r2._asdict() | measured
+        for ahead, r2 in one.r2.items()
+        if r2 is not None
     }
-    shares |= {f"{metric}[{tag}]": estimate._asdict() | measured for metric, estimate in one.belief.items()}
+    others |= {f"{metric}[{tag}]": estimate._asdict() | measured for metric, estimate in one.belief.items()}
     name = f"return[{tag}]"
-    write_record(folder, {name: entry | measured} | shares, {name: one.returns})
+    write_record(folder, {name: entry | measured} | others, {name: one.returns})
 
 
 def play_test_episode(agent: WorldModelAgent, environment: Environment, seed: int, number: int) -> Episode:
@@ -162,7 +188,7 @@ def _counted(run: str, episodes: int) -> Iterator[int]:
 
 
 def _require_same_task(first: PlayedAgent, run: str, task: dict[str, Any]) -> None:
-    ours, theirs = ({k: v for k, v in each.items() if k not in _APART} for each in (first.environment, task))
+    ours, theirs = ({k: v for k, v in fields.items() if k not in _APART} for fields in (first.environment, task))
     if ours != theirs:
         raise ForbesError(
             f"{run}: its task is {theirs['task']} ({theirs}), that of {first.run} is {ours['task']} ({ours}), "

@@ -71,7 +71,7 @@ def test_what_the_model_foresees_is_that_of_the_episodes_that_measure_the_agent(
     played = [play_measured(module, data.source.environment, "evaluation", 0, number) for number in range(2)]
     data.source.close()
 
-    told = [predict_rewards(module, one, derive_seed(0, "foresight", k), "", (5,))[0] for k, one in enumerate(played)]
+    told = [predict_rewards(module, one, derive_seed(0, "foresight", k), "", (5,))[5] for k, one in enumerate(played)]
     share = r2_score(told, [torch.from_numpy(one.reward[1:]).double() for one in played])
 
     logged = read_metrics(run)["reward_explained/5"].dropna()
