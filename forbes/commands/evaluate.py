@@ -18,7 +18,7 @@ from forbes.data import Simulated
 from forbes.errors import ForbesError
 from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.estimates import Estimate
-from forbes.evaluation.metrics import SCORES, EvaluatedRun, note, pair
+from forbes.evaluation.metrics import SCORES, EvaluatedRun, compare_pairs, record_differences
 from forbes.evaluation.record import describe, require_readable, results_folders, write_record
 from forbes.evaluation.references import references
 from forbes.evaluation.round_trip import model_round_trip, print_round_trip
@@ -63,7 +63,7 @@ def main(argv: Sequence[str]) -> None:
     print_runs(measured)
     print_references(measured)
     if len(measured) > 1:
-        print_pairs(pair(measured))
+        print_pairs(compare_pairs(measured))
     print_degradation(measured)
 
 
@@ -93,8 +93,8 @@ def evaluate(
             date = datetime.now(UTC).isoformat(timespec="seconds")
             entry.update(command=command, commit=commit(), seed=args.seed, date=date, parameters=run.parameters)
         measured.append(one)
-    for first, second, differences in pair(measured):
-        note(first, second, differences)
+    for first, second, differences in compare_pairs(measured):
+        record_differences(first, second, differences)
     for one in measured:
         write_record(folders[one.run.path], one.entries | _round_trip(one.run, args), one.totals)
     for parts in finished:

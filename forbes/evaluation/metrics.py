@@ -15,7 +15,16 @@ from torch import Tensor
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import TrainedRun
 
-__all__ = ["SCORES", "EvaluatedRun", "Pair", "at_horizons", "degradation", "note", "pair", "score_of"]
+__all__ = [
+    "SCORES",
+    "EvaluatedRun",
+    "Pair",
+    "at_horizons",
+    "compare_pairs",
+    "degradation",
+    "record_differences",
+    "score_of",
+]
 
 _ALL_PAIRS = 4  # up to this many runs, all pairs are compared; with more runs, each is compared with the first
 SCORES = ("elbo", "iwae", "pll", "fivo", "open_loop")
@@ -49,7 +58,7 @@ def score_of(metric: str) -> str:
     return metric.partition("/")[2].partition("[")[0]
 
 
-def pair(measured: Sequence[EvaluatedRun]) -> list[Pair]:
+def compare_pairs(measured: Sequence[EvaluatedRun]) -> list[Pair]:
     """Compare all pairs of runs; with more than four runs, compare each with the first."""
     pairs = list(itertools.combinations(measured, 2))
     if len(measured) > _ALL_PAIRS:
@@ -68,7 +77,7 @@ def pair(measured: Sequence[EvaluatedRun]) -> list[Pair]:
     ]
 
 
-def note(first: EvaluatedRun, second: EvaluatedRun, differences: dict[str, Estimate]) -> None:
+def record_differences(first: EvaluatedRun, second: EvaluatedRun, differences: dict[str, Estimate]) -> None:
     """Add the differences of a pair to the entries of both runs."""
     for name, difference in differences.items():
         for one, other, sign in [(first, second, 1), (second, first, -1)]:

@@ -16,7 +16,7 @@ from forbes.commands.cli import main
 from forbes.commands.evaluate import evaluate as measure
 from forbes.errors import ForbesError
 from forbes.evaluation import scoring
-from forbes.evaluation.metrics import EvaluatedRun, pair
+from forbes.evaluation.metrics import EvaluatedRun, compare_pairs
 from forbes.evaluation.references import references
 from forbes.evaluation.runs import load_runs, split_batches
 from forbes.evaluation.scoring import PartialScores, make_scorer, score_split
@@ -385,7 +385,7 @@ def test_the_tables_fit_the_terminal_and_cut_no_name(runs, capsys, monkeypatch, 
 
     tables.print_runs(measured)
     tables.print_references(measured)
-    tables.print_pairs(pair(measured))
+    tables.print_pairs(compare_pairs(measured))
 
     lines = capsys.readouterr().out.splitlines()
     table = [line for line in lines if line[:1] in "┏┃┡│└├"]
