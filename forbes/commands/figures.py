@@ -18,7 +18,7 @@ from forbes.evaluation.record import read_record
 from forbes.evaluation.references import reference_means
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
 from forbes.figures.returns import returns_against_env_steps
-from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
+from forbes.figures.strokes import FamilyCurves, ambiguous_digits, elbo_against_updates, predictions
 from forbes.figures.style import PALETTE, save_figure
 from forbes.runs.folder import RunFolder, read_config, read_metrics
 
@@ -85,7 +85,7 @@ def _task(path: Path) -> str:
         raise ForbesError(f"{path}: its data have no task, expected Experience. Name runs of agents") from error
 
 
-def group(runs: Sequence[TrainedRun]) -> list[Family]:
+def group(runs: Sequence[TrainedRun]) -> list[FamilyCurves]:
     """Group runs into families, whose configurations differ only in the seed."""
     members: list[list[TrainedRun]] = []
     for run in runs:
@@ -98,7 +98,7 @@ def group(runs: Sequence[TrainedRun]) -> list[Family]:
     titles = run_titles([first for first, *_ in members])
     for runs_of_one, title, colour in zip(members, titles, cycle(PALETTE), strict=False):
         tests = [value for run in runs_of_one if (value := _test_elbo(run)) is not None]
-        families.append(Family(title, colour, runs_of_one[0].model, [_curve(run) for run in runs_of_one], tests))
+        families.append(FamilyCurves(title, colour, runs_of_one[0].model, [_curve(run) for run in runs_of_one], tests))
     return families
 
 

@@ -15,10 +15,10 @@ from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import COLUMN, draw_range, draw_references, paper_style, show_settled
 from forbes.models import BeliefModel
 
-__all__ = ["Family", "ambiguous_digits", "elbo_against_updates", "predictions"]
+__all__ = ["FamilyCurves", "ambiguous_digits", "elbo_against_updates", "predictions"]
 
 
-class Family(NamedTuple):
+class FamilyCurves(NamedTuple):
     """Runs of one configuration, with different seeds."""
 
     name: str
@@ -32,7 +32,7 @@ class Family(NamedTuple):
 
 
 def predictions(
-    families: Sequence[Family],
+    families: Sequence[FamilyCurves],
     source: SequenceSource,
     batch: SequenceBatch,
     time: int,
@@ -65,7 +65,7 @@ def predictions(
     return draw_panels(panels)
 
 
-def elbo_against_updates(families: Sequence[Family], references: Mapping[str, float]) -> Figure:
+def elbo_against_updates(families: Sequence[FamilyCurves], references: Mapping[str, float]) -> Figure:
     """Draw Figure 5: validation ELBO against updates, mean and range over runs; a diamond is the final test ELBO.
 
     A family trained with another bound is drawn with that bound, and the legend then names all bounds. Dotted lines are

@@ -17,7 +17,7 @@ from forbes.data import SequenceDataModule, Strokes
 from forbes.data.strokes.file import StrokeArrays, save_strokes
 from forbes.evaluation.runs import load_runs
 from forbes.figures.grids import Panel, draw_panels
-from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates
+from forbes.figures.strokes import FamilyCurves, ambiguous_digits, elbo_against_updates
 from forbes.figures.style import BLACK, BLUE, ORANGE, paper_style, save_figure
 from forbes.runs.folder import read_metrics
 
@@ -106,7 +106,9 @@ def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo
 
 def test_a_family_is_drawn_where_all_its_runs_have_values():
     curves = [pd.Series([-3.0, -2.0, -1.0], [10, 20, 30]), pd.Series([-5.0, -4.0], [10, 20])]
-    (axes,) = elbo_against_updates([Family("A", BLUE, SimpleNamespace(bound_name="elbo[S=1]"), curves, [])], {}).axes
+    (axes,) = elbo_against_updates(
+        [FamilyCurves("A", BLUE, SimpleNamespace(bound_name="elbo[S=1]"), curves, [])], {}
+    ).axes
     assert axes.get_ylabel() == "validation ELBO[S=1]\nnats per sequence"
     assert list(axes.lines[0].get_xdata()) == [10, 20]
     assert list(axes.lines[0].get_ydata()) == [-4.0, -3.0]
