@@ -11,8 +11,8 @@ from forbes.commands.parsers.theorem import parser
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.theorem import (
+    ClosedFormProcess,
     Conditional,
-    LinearGaussian,
     belief_scores,
     between,
     elbo,
@@ -30,7 +30,7 @@ from forbes.seeding import generator
 __all__ = ["main"]
 
 _CASES = ((1.0, 1.0, 1.0), (1.0, 0.1, 1.0), (0.9, 0.3, 0.5))
-_POSTERIORS: Mapping[str, Callable[[LinearGaussian], Conditional]] = {
+_POSTERIORS: Mapping[str, Callable[[ClosedFormProcess], Conditional]] = {
     "exact p(s_t | o_1:t)": exact_filter,
     "exact p(s_t | s_t-1, o_t)": exact_one_step,
     "optimal q(s_t | o_1:t)": factorised_optimum,
@@ -64,16 +64,16 @@ def main(argv: Sequence[str]) -> None:
     console.print(_scan(processes), _SCAN, sep="\n", highlight=False)
 
 
-def _processes(args: argparse.Namespace) -> list[LinearGaussian]:
+def _processes(args: argparse.Namespace) -> list[ClosedFormProcess]:
     """Return the process given by the arguments, or three processes by default."""
     given = (args.transition, args.process_noise, args.observation_noise)
     if given == (None, None, None):
-        return [LinearGaussian(*case, args.steps) for case in _CASES]
+        return [ClosedFormProcess(*case, args.steps) for case in _CASES]
     transition, process_noise, observation_noise = (1.0 if value is None else value for value in given)
-    return [LinearGaussian(transition, process_noise, observation_noise, args.steps)]
+    return [ClosedFormProcess(transition, process_noise, observation_noise, args.steps)]
 
 
-def _name(process: LinearGaussian) -> str:
+def _name(process: ClosedFormProcess) -> str:
     return f"F={process.transition:g} Q={process.process_noise:g} R={process.observation_noise:g}"
 
 
@@ -84,7 +84,7 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def _identity(processes: Sequence[LinearGaussian], samples: int, seed: int) -> Table:
+def _identity(processes: Sequence[ClosedFormProcess], samples: int, seed: int) -> Table:
     """Return a table of both sides of the identity, and of the paper's form of it."""
     table = _table(
         f"Theorem 1 in nats per sequence, {processes[0].steps} steps, {samples} samples", "posterior", "log p - ELBO",
@@ -110,7 +110,7 @@ def _identity(processes: Sequence[LinearGaussian], samples: int, seed: int) -> T
     return table
 
 
-def _beliefs(processes: Sequence[LinearGaussian]) -> Table:
+def _beliefs(processes: Sequence[ClosedFormProcess]) -> Table:
     """Return a table of the scores of each posterior by its ELBO, and as a belief."""
     table = _table(
         "Scores of the same posteriors as beliefs q(s_t | o_1:t)", "belief", "log p - ELBO", "log p - PLL",
@@ -127,7 +127,7 @@ def _beliefs(processes: Sequence[LinearGaussian]) -> Table:
     return table
 
 
-def _scan(processes: Sequence[LinearGaussian]) -> Table:
+def _scan(processes: Sequence[ClosedFormProcess]) -> Table:
     """Return a table that ranks beliefs between the exact filter and the factorised optimum by ELBO and by PLL."""
     table = _table(
         "Which belief is better?", "interpolation", "log p - ELBO", "rank by ELBO", "log p - PLL", "rank by PLL"

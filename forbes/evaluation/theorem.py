@@ -19,12 +19,12 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal, Normal
 
-__all__ = ["BeliefScores", "Conditional", "LinearGaussian", "belief_scores", "between", "elbo", "exact_filter"]
+__all__ = ["BeliefScores", "ClosedFormProcess", "Conditional", "belief_scores", "between", "elbo", "exact_filter"]
 __all__ += ["exact_one_step", "expected_kl", "factorised_optimum", "log_evidence", "sample_gap", "smoothing"]
 __all__ += ["structured_optimum"]
 
 
-class LinearGaussian(NamedTuple):
+class ClosedFormProcess(NamedTuple):
     """Parameters of the process, with variances instead of standard deviations."""
 
     transition: float = 1.0
@@ -96,7 +96,7 @@ def _shift(steps: int) -> Tensor:
     return torch.diag(torch.ones(steps - 1, dtype=torch.float64), -1)
 
 
-def log_evidence(process: LinearGaussian, moment: Tensor) -> Tensor:
+def log_evidence(process: ClosedFormProcess, moment: Tensor) -> Tensor:
     """Return the mean of log p(o_1:T) in nats over observations with this second moment, by one-step predictions."""
     predicted = _predictive(process, exact_filter(process))
     innovation = torch.eye(process.steps, dtype=torch.float64) - predicted.gain  # times o: the prediction error
@@ -104,7 +104,7 @@ def log_evidence(process: LinearGaussian, moment: Tensor) -> Tensor:
     return -0.5 * ((2 * math.pi * predicted.variance).log() + square / predicted.variance).sum()
 
 
-def elbo(process: LinearGaussian, posterior: Conditional, moment: Tensor) -> Tensor:
+def elbo(process: ClosedFormProcess, posterior: Conditional, moment: Tensor) -> Tensor:
     """Return the mean of E_q[log p(s, o) - log q(s | o)] in nats over observations with this second moment."""
     square = (process.precision() * posterior.joint_moment(moment)).sum()
     constant = 2 * process.steps * math.log(2 * math.pi) + process.steps * math.log(process.observation_noise)
@@ -125,7 +125,7 @@ def expected_kl(posterior: Conditional, target: Conditional, moment: Tensor) -> 
     return 0.5 * (ratio - 1 - ratio.log() + square / target.variance).sum()
 
 
-def exact_filter(process: LinearGaussian) -> Conditional:
+def exact_filter(process: ClosedFormProcess) -> Conditional:
     """Return the exact belief p(s_t | o_1:t) by the Kalman filter; as a posterior it is independent over t."""
     gains, variances = [], []
     gain = torch.zeros(process.steps, dtype=torch.float64)
@@ -141,18 +141,18 @@ def exact_filter(process: LinearGaussian) -> Conditional:
     return Conditional(zero, torch.stack(gains), torch.stack(variances))
 
 
-def exact_one_step(process: LinearGaussian) -> Conditional:
+def exact_one_step(process: ClosedFormProcess) -> Conditional:
     """Return p(s_t | s_{t-1}, o_t), which is exact except that it ignores later observations."""
     zero = torch.zeros(process.steps, process.steps, dtype=torch.float64)
     return _with_future(process, zero[0], zero)
 
 
-def smoothing(process: LinearGaussian) -> Conditional:
+def smoothing(process: ClosedFormProcess) -> Conditional:
     """Return p(s_t | s_{t-1}, o_t:T), the true conditionals of the posterior p(s | o)."""
     return _with_future(process, *_future(process))
 
 
-def structured_optimum(process: LinearGaussian) -> Conditional:
+def structured_optimum(process: ClosedFormProcess) -> Conditional:
     """Return the q(s_t | s_{t-1}, o_1:t) with the highest ELBO.
 
     It is `smoothing` with each later o_u replaced by E[o_u | o_1:t]. Its variance is that of a posterior that knows the
@@ -168,7 +168,7 @@ def structured_optimum(process: LinearGaussian) -> Conditional:
     return _with_future(process, precision, weight * exact_filter(process).gain)
 
 
-def _future(process: LinearGaussian) -> tuple[Tensor, Tensor]:
+def _future(process: ClosedFormProcess) -> tuple[Tensor, Tensor]:
     r"""Return J, `(T,)`, and H, `(T, T)`, the information of future observations about s_t.
 
     .. math:: p(o_{t+1:T} \mid s_t) \propto \exp(-J_t s_t^2 / 2 + s_t \sum_u H_{tu} o_u)
@@ -188,7 +188,7 @@ def _future(process: LinearGaussian) -> tuple[Tensor, Tensor]:
     return torch.stack(precisions[::-1]), torch.stack(rows[::-1])  # (T,), (T, T)
 
 
-def _with_future(process: LinearGaussian, precision: Tensor, information: Tensor) -> Conditional:
+def _with_future(process: ClosedFormProcess, precision: Tensor, information: Tensor) -> Conditional:
     r"""Normalise :math:`p(s_t \mid s_{t-1})\, p(o_t \mid s_t)\, \exp(-J_t s_t^2 / 2 + s_t \sum_u H_{tu} o_u)`."""
     variance = 1 / (1 / process.noise() + 1 / process.observation_noise + precision)
     carry = variance * process.transition / process.noise()
@@ -197,7 +197,7 @@ def _with_future(process: LinearGaussian, precision: Tensor, information: Tensor
     return Conditional(carry, variance[:, None] * (current + information), variance)
 
 
-def factorised_optimum(process: LinearGaussian) -> Conditional:
+def factorised_optimum(process: ClosedFormProcess) -> Conditional:
     r"""Return the q(s_t | o_1:t), independent over t, with the highest ELBO.
 
     With L the precision of s given o, its variance is :math:`1 / L_{tt}`, that of s_t given both neighbours. Its mean
@@ -249,7 +249,7 @@ class BeliefScores(NamedTuple):
     """Probability that the belief's central 90 % hold the true state, at the middle step."""
 
 
-def belief_scores(process: LinearGaussian, posterior: Conditional) -> BeliefScores:
+def belief_scores(process: ClosedFormProcess, posterior: Conditional) -> BeliefScores:
     r"""Score a posterior that depends on the past only, in closed form.
 
     The true state is :math:`N(\mu_t, P_t)` given o_1:t, so its distance from a belief's mean m has variance
@@ -271,14 +271,14 @@ def belief_scores(process: LinearGaussian, posterior: Conditional) -> BeliefScor
     )
 
 
-def _predictive(process: LinearGaussian, belief: Conditional) -> Conditional:
+def _predictive(process: ClosedFormProcess, belief: Conditional) -> Conditional:
     """Return the belief's densities of the next observation, p(o_t | belief at t - 1)."""
     before = _shift(process.steps)
     spread = process.transition**2 * before @ belief.variance + process.noise() + process.observation_noise  # (T,)
     return Conditional(belief.carry, process.transition * before @ belief.gain, spread)
 
 
-def sample_gap(process: LinearGaussian, posterior: Conditional, samples: int, generator: torch.Generator) -> Tensor:
+def sample_gap(process: ClosedFormProcess, posterior: Conditional, samples: int, generator: torch.Generator) -> Tensor:
     """Sample o from the process and s from q(s | o); return log p(o) - log p(s, o) + log q(s | o) in nats, `(N,)`."""
     noise = torch.randn(3, process.steps, samples, generator=generator, dtype=torch.float64)
     state, observations = torch.zeros(samples, dtype=torch.float64), []

@@ -8,10 +8,10 @@ import torch
 from forbes.errors import ForbesError
 from forbes.evaluation.calibration.ranks import coverage, ranks, tarp_ranks, two_sample_test
 from forbes.evaluation.calibration.uniformity import kolmogorov_smirnov, pearson, spread
-from forbes.evaluation.theorem import LinearGaussian, exact_filter, factorised_optimum, structured_optimum
+from forbes.evaluation.theorem import ClosedFormProcess, exact_filter, factorised_optimum, structured_optimum
 
 LEVEL, SAMPLES = 0.05, 50
-PROCESS = LinearGaussian(1.0, 1.0, 1.0, steps=15)
+PROCESS = ClosedFormProcess(1.0, 1.0, 1.0, steps=15)
 MIDDLE = 7
 
 
