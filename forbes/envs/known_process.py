@@ -9,7 +9,7 @@ from torch import Tensor
 
 from forbes.envs.base import Environment, Step
 from forbes.errors import ForbesError
-from forbes.pomdps import CategoricalBelief, ExactBelief, GaussianMixtureBelief, Process
+from forbes.pomdps import ExactBelief, FiniteBelief, GaussianMixtureBelief, Process
 from forbes.pomdps.base import require_positive
 from forbes.pomdps.hmm import FiniteProcess
 
@@ -93,7 +93,7 @@ class KnownProcess(Environment):
 
 def _parameters(belief: ExactBelief) -> Tensor:
     """Return the parameters of the last belief of a sequence, `(O,)`."""
-    if isinstance(belief, CategoricalBelief):
+    if isinstance(belief, FiniteBelief):
         return belief.mean[0, -1]  # (S,)
     if not isinstance(belief, GaussianMixtureBelief):
         raise ForbesError(

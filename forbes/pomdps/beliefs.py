@@ -9,7 +9,7 @@ from torch.nn.functional import one_hot
 
 from forbes.pomdps.distributions import Distribution, draw_index, draw_normal
 
-__all__ = ["CategoricalBelief", "ExactBelief", "GaussianMixtureBelief", "GridBelief"]
+__all__ = ["ExactBelief", "FiniteBelief", "GaussianMixtureBelief", "GridBelief"]
 
 
 class ExactBelief(Distribution):
@@ -149,7 +149,7 @@ class GridBelief(ExactBelief):
         return torch.arange(self.log_mass.shape[-1], dtype=self.log_mass.dtype, device=self.log_mass.device)  # (G,)
 
 
-class CategoricalBelief(ExactBelief):
+class FiniteBelief(ExactBelief):
     """A finite distribution over one-hot vectors.
 
     Args:

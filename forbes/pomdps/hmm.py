@@ -5,7 +5,7 @@ from torch import Tensor
 
 from forbes.errors import ForbesError
 from forbes.pomdps.base import ExactFilter, Process
-from forbes.pomdps.beliefs import CategoricalBelief
+from forbes.pomdps.beliefs import FiniteBelief
 
 __all__ = ["FiniteProcess"]
 
@@ -29,22 +29,22 @@ class FiniteProcess(Process):
         self.action_dim, self.state_dim = transition.shape[:2]
         self.observation_dim = emission.shape[-1]
 
-    def initial(self, like: Tensor) -> CategoricalBelief:
+    def initial(self, like: Tensor) -> FiniteBelief:
         """See `Process.initial`."""
-        return CategoricalBelief(self.initial_table.log().to(like))
+        return FiniteBelief(self.initial_table.log().to(like))
 
-    def transition(self, state: Tensor, action: Tensor) -> CategoricalBelief:
+    def transition(self, state: Tensor, action: Tensor) -> FiniteBelief:
         """See `Process.transition`."""
         table = self.transition_table.log().to(state)
-        return CategoricalBelief(table[action.argmax(-1), state.argmax(-1)])  # (*, S)
+        return FiniteBelief(table[action.argmax(-1), state.argmax(-1)])  # (*, S)
 
-    def emission(self, state: Tensor) -> CategoricalBelief:
+    def emission(self, state: Tensor) -> FiniteBelief:
         """See `Process.emission`."""
-        return CategoricalBelief(self.emission_table.log().to(state)[state.argmax(-1)])  # (*, O)
+        return FiniteBelief(self.emission_table.log().to(state)[state.argmax(-1)])  # (*, O)
 
     def policy(self, sequences: int, steps: int, generator: torch.Generator) -> Tensor:
         """See `Process.policy`."""
-        action = CategoricalBelief(self.policy_table.log())
+        action = FiniteBelief(self.policy_table.log())
         return action.sample(sequences * steps, generator).view(sequences, steps, -1)  # (B, steps, A)
 
     def exact_filter(self, observation: Tensor, action: Tensor) -> ExactFilter:
@@ -71,7 +71,7 @@ class FiniteProcess(Process):
                 f"{type(self).__name__}: sequence {sequence} has probability 0 from step {step} on, expected a "
                 "possible sequence. Compare the parameters with those that generated the data"
             )
-        return ExactFilter(CategoricalBelief(torch.stack(masses, 1).log()), evidence.log())  # (B, T, S), (B, T)
+        return ExactFilter(FiniteBelief(torch.stack(masses, 1).log()), evidence.log())  # (B, T, S), (B, T)
 
     def _require_one_hot(self, name: str, values: Tensor, first: int) -> None:
         right = ((values == 0) | (values == 1)).all(-1) & (values.sum(-1) == 1)  # (B, T)

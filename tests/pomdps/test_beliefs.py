@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
-from forbes.pomdps import CategoricalBelief, GaussianMixtureBelief, GridBelief
+from forbes.pomdps import FiniteBelief, GaussianMixtureBelief, GridBelief
 
 
 def random(*shape, seed=0):
@@ -27,7 +27,7 @@ def grid(*shape, cells=50):
 def categorical(*shape, values=5):
     log_mass = random(*shape, values)
     log_mass[..., 0] = -torch.inf  # impossible values are allowed
-    return CategoricalBelief(log_mass.log_softmax(-1))
+    return FiniteBelief(log_mass.log_softmax(-1))
 
 
 BELIEFS = {"gaussian": lambda *shape: mixture(*shape, components=1), "mixture": mixture, "grid": grid}
