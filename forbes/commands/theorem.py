@@ -47,8 +47,8 @@ _BELIEFS = """\
 The exact filter p(s_t | o_1:t) predicts best (PLL) and has its nominal coverage, yet its ELBO is lower than that of
 both optima. The optima have too small variances and cover less than their nominal 90 %."""
 _SCAN = """\
-Between the exact filter and the optimal q(s_t | o_1:t), the ELBO and the prequential score rank the beliefs in opposite
-orders."""
+Between the exact filter and the optimal q(s_t | o_1:t), the ELBO and the prequential score rank the beliefs in
+opposite orders."""
 
 
 def main(argv: Sequence[str]) -> None:

@@ -125,7 +125,7 @@ def test_pixels_are_what_it_draws_made_smaller():
         ("toy_gymnasium:Toy-Room-v0", "gymnasium has no such environment. Did you mean Toy-Rooms-v0"),
         ("no_such_package:Thing-v0", "no_such_package:Thing-v0: gymnasium has no such environment"),
         ("forbes/Needy-v0", "forbes/Needy-v0: Box2D is not installed"),
-        ("forbes/Levers-v0", "its actions are a MultiDiscrete, expected a Box or a Discrete. Wrap it"),
+        ("forbes/Levers-v0", "its actions are a MultiDiscrete, expected a Box or a Discrete. Wrap and register it"),
     ],
 )
 def test_what_cannot_be_used_is_one_sentence(task, sentence):
@@ -310,7 +310,7 @@ NODES = Graph(Box(-1.0, 1.0, (2,)), None)
     ],
 )
 def test_a_space_that_is_no_array_is_refused_by_name(space, sentence, monkeypatch):
-    with pytest.raises(ForbesError, match="registers it, and name that: gymnasium:MODULE:ID") as error:
+    with pytest.raises(ForbesError, match="in a module of your own, and use: gymnasium:MODULE:ID") as error:
         environment_of(monkeypatch, space)
     assert sentence in str(error.value)
 

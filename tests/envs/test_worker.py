@@ -202,7 +202,7 @@ def test_a_script_without_a_guard_is_told_what_it_lacks(tmp_path):
     done = run_script(tmp_path, "EnvironmentProcess(find_environment('tiger'))\n")
 
     assert done.returncode != 0
-    assert 'keep its commands under `if __name__ == "__main__":`' in done.stderr.splitlines()[-1]
+    assert 'guard its code with `if __name__ == "__main__":`' in done.stderr.splitlines()[-1]
 
 
 NOTEBOOK = """
