@@ -16,7 +16,7 @@ from forbes.seeding import derive_seed
 __all__ = [
     "ATTEMPTS",
     "MakePolicy",
-    "Policy",
+    "EpisodePolicy",
     "collect_episodes",
     "describe_environment",
     "episode_seed",
@@ -25,16 +25,16 @@ __all__ = [
     "random_policy",
 ]
 
-Policy: TypeAlias = Callable[[NDArray[Any]], NDArray[np.float32]]
+EpisodePolicy: TypeAlias = Callable[[NDArray[Any]], NDArray[np.float32]]
 """Function that chooses a_t, float32 `(A,)`, given o_t. It is used for one episode only and may have a memory."""
-MakePolicy: TypeAlias = Callable[[Environment, int], Policy]
+MakePolicy: TypeAlias = Callable[[Environment, int], EpisodePolicy]
 """Function that makes the policy of an episode from the environment and a random seed."""
 
 ATTEMPTS = 3
 """Maximal number of attempts to play an episode."""
 
 
-def random_policy(environment: Environment, seed: int) -> Policy:
+def random_policy(environment: Environment, seed: int) -> EpisodePolicy:
     """Make a policy with independent uniform actions, in [-1, 1]^A or one-hot."""
     random, count = np.random.default_rng(seed), environment.action_dim
     if environment.discrete:
@@ -42,7 +42,7 @@ def random_policy(environment: Environment, seed: int) -> Policy:
     return lambda _: random.uniform(-1, 1, count).astype(np.float32)
 
 
-def play(environment: Environment, policy: Policy, seed: int) -> Episode:
+def play(environment: Environment, policy: EpisodePolicy, seed: int) -> Episode:
     """Play one episode from its reset to its end.
 
     Raises:
