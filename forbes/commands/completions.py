@@ -10,10 +10,10 @@ from forbes.commands.parsers.completions import parser
 from forbes.data import Strokes
 from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, load_classifiers
 from forbes.errors import ForbesError
-from forbes.evaluation.digits.completions import prefixes
+from forbes.evaluation.digits.completions import select_prefixes
 from forbes.evaluation.digits.study import Study, entries, print_study, study
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
-from forbes.figures.completions import by_ambiguity, drawings, errors, scores
+from forbes.figures.completions import by_ambiguity, draw_class_scores, draw_completions, draw_errors
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
 from forbes.runs.provenance import command_line, commit
@@ -32,12 +32,12 @@ def main(argv: Sequence[str]) -> None:
     hashes = [data_sha256(run.data, args.split, args.sequences) for run in runs]
     require_comparable(runs, hashes)
     assert isinstance(data.source, Strokes)
-    judges = load_classifiers(data.source.origin)
+    classifiers = load_classifiers(data.source.origin)
     named = dict(zip(run_titles(runs), runs, strict=True))
     studies = []
     for context in sorted(set(args.prefixes)):
-        beginnings = prefixes(data, args.split, args.sequences, context, judges.prefix)
-        studies.append(study(named, judges, beginnings, args.split, args.samples, args.seed))
+        chosen = select_prefixes(data, args.split, args.sequences, context, classifiers.prefix)
+        studies.append(study(named, classifiers, chosen, args.split, args.samples, args.seed))
         print_study(studies[-1], data.length)
     record = {
         "command": command_line("completions", *argv),
@@ -87,13 +87,13 @@ def _write(args: Any, record: dict[str, Any], studies: Sequence[Study]) -> None:
 
 
 def _draw(args: Any, runs: Sequence[TrainedRun], studies: Sequence[Study]) -> None:
-    figures = {"completions-scores": scores(studies), "completions-errors": errors(studies)}
+    figures = {"completions-scores": draw_class_scores(studies), "completions-errors": draw_errors(studies)}
     for one in studies:
         place = by_ambiguity(one.prefixes.reference, _DRAWN)
         end = int(one.prefixes.steps[place].max())
         batch = runs[0].data.sequences(args.split, one.prefixes.digits[place], end)
         models = [run.model for run in runs]
-        figures[f"completions-c{one.prefixes.context}"] = drawings(
+        figures[f"completions-c{one.prefixes.context}"] = draw_completions(
             one, models, runs[0].data.source, batch, place, args.seed
         )
     for name, figure in figures.items():

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Strokes
-from forbes.evaluation.digits.neighbours import Beginnings, last_frame
+from forbes.evaluation.digits.neighbours import TrainingPrefixes, last_frame
 from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import COLUMN, draw_range, draw_references, paper_style, show_settled
@@ -106,7 +106,7 @@ def ambiguous_digits(data: SequenceDataModule, context: int, candidates: int = 5
     labels, test_labels = source.labels("train"), source.labels("test")[:candidates]
     index = torch.arange(len(test_labels))
     test = source.pictures(data.sequences("test", index, context).observation)  # (N, T, C, H, W)
-    nearest = Beginnings(data, context, last_frame).nearest(test, neighbours)  # (N, neighbours)
+    nearest = TrainingPrefixes(data, context, last_frame).nearest(test, neighbours)  # (N, neighbours)
     counts = torch.nn.functional.one_hot(labels[nearest], 10).sum(1).double()  # (N, 10)
     entropy = torch.special.entr(counts / counts.sum(1, keepdim=True)).sum(1)  # (N,)
     return torch.stack(

@@ -19,8 +19,8 @@ from forbes.data.strokes.file import SIDE
 from forbes.data.strokes.source import Strokes
 from forbes.seeding import derive_seed, generator
 
-__all__ = ["Digits", "Quality", "calibrate", "classify", "digits_of", "draw_finished", "draw_prefix", "fit", "quality"]
-__all__ += ["train_classifiers"]
+__all__ = ["Digits", "Quality", "calibrate", "classify", "digits_of", "draw_finished", "draw_prefix", "quality"]
+__all__ += ["fit_classifier", "train_classifiers"]
 
 _NEVER = 255  # the longest digit has 106 points
 _FINISHED_EPOCHS, _PREFIX_EPOCHS, _SEED = 7, 6, 0
@@ -66,9 +66,9 @@ def train_classifiers(sources: Mapping[str, Strokes]) -> dict[str, DigitClassifi
     """
     train = {name: digits_of(source, "train") for name, source in sources.items()}
     together = Digits(*(torch.cat(values) for values in zip(*train.values(), strict=True)))
-    classifiers = {"finished": fit(together, draw_finished, _FINISHED_EPOCHS, _SEED)}
+    classifiers = {"finished": fit_classifier(together, draw_finished, _FINISHED_EPOCHS, _SEED)}
     for name, source in sources.items():
-        classifiers[f"prefix-{name}"] = fit(train[name], draw_prefix, _PREFIX_EPOCHS, _SEED)
+        classifiers[f"prefix-{name}"] = fit_classifier(train[name], draw_prefix, _PREFIX_EPOCHS, _SEED)
         calibrate(classifiers[f"prefix-{name}"], digits_of(source, "validation"))
     return {name: classifier.half().float() for name, classifier in classifiers.items()}
 
@@ -85,7 +85,9 @@ def digits_of(source: Strokes, split: Split) -> Digits:
     return Digits(torch.from_numpy(first_visit), torch.from_numpy(points).long(), source.labels(split))
 
 
-def fit(digits: Digits, draw: Callable[[Digits], tuple[Tensor, Tensor]], epochs: int, seed: int) -> DigitClassifier:
+def fit_classifier(
+    digits: Digits, draw: Callable[[Digits], tuple[Tensor, Tensor]], epochs: int, seed: int
+) -> DigitClassifier:
     """Train a classifier by maximum likelihood, with Adam and a cosine schedule.
 
     Args:

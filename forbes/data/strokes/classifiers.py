@@ -94,11 +94,13 @@ def load_classifiers(origin: Literal["bundled", "dejong"]) -> DigitClassifiers:
     weights = read_npz(path, remedy)
     if (found := _sha256(weights)) != CLASSIFIERS_SHA256:
         raise ForbesError(f"{path}: weights of sha256 {found[:16]}…, expected {CLASSIFIERS_SHA256[:16]}…. {remedy}")
-    judges = DigitClassifiers(DigitClassifier(1), DigitClassifier(2))
-    for judge, name in zip(judges, ("finished", f"prefix-{origin}"), strict=True):
-        judge.load_state_dict({key: torch.from_numpy(weights[f"{name}.{key}"]).float() for key in judge.state_dict()})
-        judge.eval().requires_grad_(False)
-    return judges
+    classifiers = DigitClassifiers(DigitClassifier(1), DigitClassifier(2))
+    for classifier, name in zip(classifiers, ("finished", f"prefix-{origin}"), strict=True):
+        classifier.load_state_dict(
+            {key: torch.from_numpy(weights[f"{name}.{key}"]).float() for key in classifier.state_dict()}
+        )
+        classifier.eval().requires_grad_(False)
+    return classifiers
 
 
 def save_weights(path: Path, classifiers: Mapping[str, DigitClassifier]) -> str:

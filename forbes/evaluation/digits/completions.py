@@ -20,7 +20,7 @@ from torch import Tensor
 from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
 from forbes.data.strokes.classifiers import DigitClassifier, DigitClassifiers
 from forbes.errors import ForbesError
-from forbes.evaluation.digits.neighbours import Beginnings, mean_frame
+from forbes.evaluation.digits.neighbours import TrainingPrefixes, mean_frame
 from forbes.evaluation.digits.scores import (
     average_of,
     best_of,
@@ -36,8 +36,8 @@ from forbes.evaluation.scores import Increments
 from forbes.evaluation.scoring import Scorer
 from forbes.models import BeliefModel
 
-__all__ = ["Prefixes", "model_pass", "neighbour_pass", "prefixes", "score_completions", "summarise"]
-__all__ += ["summarise_classes", "truth_pass"]
+__all__ = ["Prefixes", "model_scorer", "neighbour_scorer", "score_completions", "select_prefixes", "summarise"]
+__all__ += ["summarise_classes", "truth_scorer"]
 
 _SHARES = (60, 80)
 """Percentages of the remaining steps after which a completion's class is compared with its final class."""
@@ -73,7 +73,9 @@ class Prefixes(NamedTuple):
             yield int(rows[0]), data.sequences(split, self.digits[rows], int(self.steps.max()))
 
 
-def prefixes(data: SequenceDataModule, split: Split, digits: int, context: int, judge: DigitClassifier) -> Prefixes:
+def select_prefixes(
+    data: SequenceDataModule, split: Split, digits: int, context: int, classifier: DigitClassifier
+) -> Prefixes:
     """Return the prefixes of those of the first `digits` digits of a split that continue after `context` steps.
 
     Raises:
@@ -89,7 +91,7 @@ def prefixes(data: SequenceDataModule, split: Split, digits: int, context: int, 
             "2. Choose a smaller prefix, or more digits"
         )
     observation = data.source.pictures(data.sequences(split, index, context).observation)
-    reference = judge(_history(last=observation[:, -1].float(), mean=mean_frame(observation))).double().exp()
+    reference = classifier(_history(last=observation[:, -1].float(), mean=mean_frame(observation))).double().exp()
     return Prefixes(context, index, steps[index], data.source.labels(split)[index], reference)
 
 
@@ -98,45 +100,45 @@ def _history(last: Tensor, mean: Tensor) -> Tensor:
     return torch.cat((last, mean), -3)
 
 
-def model_pass(data: SequenceDataModule, context: int, samples: int, judges: DigitClassifiers) -> Scorer:
+def model_scorer(data: SequenceDataModule, context: int, samples: int, classifiers: DigitClassifiers) -> Scorer:
     """Return the scorer of a model's N completions.
 
     Args:
         data: data module of strokes, of the length that models were trained with.
         context: number of steps that the model sees, c.
         samples: number of completions, N, at least 2.
-        judges: classifiers of the digits.
+        classifiers: classifiers of the digits.
     """
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _to_the_end(batch)
         frames = complete(model, data.source, batch, context, samples).frames  # (N, B, T - c, 1, H, W)
-        return score_completions(frames, _pictures(data, batch), context, data.length, judges)
+        return score_completions(frames, _pictures(data, batch), context, data.length, classifiers)
 
     return Scorer(_READINGS, f"c={context},N={samples}", function, _ROWS)
 
 
-def truth_pass(data: SequenceDataModule, context: int, judges: DigitClassifiers) -> Scorer:
+def truth_scorer(data: SequenceDataModule, context: int, classifiers: DigitClassifiers) -> Scorer:
     """Return the scorer of the true digits as completions, a bound for the scores of single completions."""
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _pictures(data, _to_the_end(batch))
         frames = batch.observation[:, context:].float().expand(_TRUTHS, -1, -1, -1, -1, -1)
-        return score_completions(frames, batch, context, data.length, judges)
+        return score_completions(frames, batch, context, data.length, classifiers)
 
     return Scorer(_READINGS, f"c={context},N={_TRUTHS}", function, _ROWS)
 
 
-def neighbour_pass(data: SequenceDataModule, context: int, samples: int, judges: DigitClassifiers) -> Scorer:
+def neighbour_scorer(data: SequenceDataModule, context: int, samples: int, classifiers: DigitClassifiers) -> Scorer:
     """Return the scorer of the N training digits with the most similar beginnings as completions."""
-    beginnings = Beginnings(data, context, mean_frame)
+    training = TrainingPrefixes(data, context, mean_frame)
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _pictures(data, _to_the_end(batch))
-        nearest = beginnings.nearest(batch.observation[:, :context], samples)  # (B, N)
+        nearest = training.nearest(batch.observation[:, :context], samples)  # (B, N)
         others = data.sequences("train", nearest.T.flatten(), batch.observation.shape[1]).observation
         frames = data.source.pictures(others)[:, context:].float().unflatten(0, (-1, len(nearest)))  # (N, B, T - c, …)
-        return score_completions(frames, batch, context, data.length, judges)
+        return score_completions(frames, batch, context, data.length, classifiers)
 
     return Scorer(_READINGS, f"c={context},N={samples}", function, _ROWS)
 
@@ -154,7 +156,7 @@ def _pictures(data: SequenceDataModule, batch: SequenceBatch) -> SequenceBatch:
 
 @torch.no_grad()
 def score_completions(
-    frames: Tensor, batch: SequenceBatch, context: int, length: int, judges: DigitClassifiers
+    frames: Tensor, batch: SequenceBatch, context: int, length: int, classifiers: DigitClassifiers
 ) -> dict[str, Tensor]:
     """Score N completions of each of B digits.
 
@@ -163,7 +165,7 @@ def score_completions(
         batch: true digits as cumulative images, T steps.
         context: number of steps that the model saw, c.
         length: training length of the models. Pixels are also scored at this step, or at the end if that is earlier.
-        judges: classifiers of the digits.
+        classifiers: classifiers of the digits.
 
     Returns:
         Values per digit, in float64: `classes`, the distribution p, `(B, 10)`; the fraction of `clear` digits, and
@@ -173,11 +175,11 @@ def score_completions(
     """
     end = batch.mask.sum(1)  # (B,)
     means, truth = _pixels(frames, batch, context, end)  # (N, B, P), (B, P)
-    classes = judges.finished(means.view(*means.shape[:2], *frames.shape[3:])).double().exp()  # (N, B, 10)
+    classes = classifiers.finished(means.view(*means.shape[:2], *frames.shape[3:])).double().exp()  # (N, B, 10)
     values = {"clear": _is_clear(classes).mean(0), "grey": grey_ink(means).mean(0)}
     for share in _SHARES:
         step = context + (share * (end - context) / 100).ceil().long()  # (B,)
-        before = _classes_at(frames, batch, context, step, judges.prefix)  # (N, B, 10)
+        before = _classes_at(frames, batch, context, step, classifiers.prefix)  # (N, B, 10)
         early, same = _is_clear(before), before.argmax(-1) == classes.argmax(-1)  # (N, B), (N, B)
         values |= {f"early {share}": early.mean(0), f"kept {share}": (early * same).mean(0)}
     for name, step in (("trained", end.clamp(max=length)), ("end", end)):
@@ -198,14 +200,16 @@ def _is_clear(classes: Tensor) -> Tensor:
     return (classes.amax(-1) > _CLEAR).double()  # (N, B)
 
 
-def _classes_at(frames: Tensor, batch: SequenceBatch, context: int, step: Tensor, judge: DigitClassifier) -> Tensor:
+def _classes_at(
+    frames: Tensor, batch: SequenceBatch, context: int, step: Tensor, classifier: DigitClassifier
+) -> Tensor:
     """Classify each completion up to one step of each digit, `(B,)`, as an unfinished digit: `(N, B, 10)`."""
     drawn = torch.arange(context + 1, context + 1 + frames.shape[2]) <= step[:, None]  # (B, T - c)
     rolled = drawn[:, None].to(frames.dtype) @ frames.flatten(3)  # (N, B, 1, P), the sum over the steps drawn
     total = rolled.view(*frames.shape[:2], *frames.shape[3:]) + batch.observation[:, :context].sum(1)
     mean = total / step.view(-1, 1, 1, 1)  # (N, B, 1, H, W)
     last = frames[:, torch.arange(len(step)), step - context - 1]  # (N, B, 1, H, W)
-    log_probs: Tensor = judge(_history(last, mean))
+    log_probs: Tensor = classifier(_history(last, mean))
     return log_probs.double().exp()
 
 

@@ -8,7 +8,7 @@ from torch.nn.functional import avg_pool2d
 
 from forbes.data import SequenceDataModule, Strokes
 
-__all__ = ["Beginnings", "last_frame", "mean_frame"]
+__all__ = ["TrainingPrefixes", "last_frame", "mean_frame"]
 
 
 def last_frame(frames: Tensor) -> Tensor:
@@ -21,8 +21,8 @@ def mean_frame(frames: Tensor) -> Tensor:
     return frames.sum(1).float() / frames.shape[1]
 
 
-class Beginnings:
-    """Beginnings of the training digits that continue after some step.
+class TrainingPrefixes:
+    """TrainingPrefixes of the training digits that continue after some step.
 
     They are compared after a blur of five pixels, so that strokes one pixel apart are near.
 

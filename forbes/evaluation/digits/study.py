@@ -14,11 +14,11 @@ from forbes.data import Split
 from forbes.data.strokes.classifiers import DigitClassifiers, calibration_error
 from forbes.evaluation.digits.completions import (
     Prefixes,
-    model_pass,
-    neighbour_pass,
+    model_scorer,
+    neighbour_scorer,
     summarise,
     summarise_classes,
-    truth_pass,
+    truth_scorer,
 )
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import TrainedRun
@@ -70,13 +70,18 @@ class Study(NamedTuple):
 
 
 def study(
-    runs: Mapping[str, TrainedRun], judges: DigitClassifiers, prefixes: Prefixes, split: Split, samples: int, seed: int
+    runs: Mapping[str, TrainedRun],
+    classifiers: DigitClassifiers,
+    prefixes: Prefixes,
+    split: Split,
+    samples: int,
+    seed: int,
 ) -> Study:
     """Complete the same prefixes with every run, and score the completions.
 
     Args:
         runs: runs on the same data, by title.
-        judges: classifiers of these data.
+        classifiers: classifiers of these data.
         prefixes: prefixes to complete.
         split: split of the digits.
         samples: number of completions per digit, N.
@@ -95,14 +100,14 @@ def study(
 
     classes = prefixes.reference
     error = calibration_error(classes, prefixes.labels)
-    scorer = model_pass(data, context, samples, judges)
+    scorer = model_scorer(data, context, samples, classifiers)
     return Study(
         prefixes,
         samples,
         Row("reference", None, summarise_classes(classes, prefixes), error, classes),
         [measure(name, run.path, run, scorer) for name, run in runs.items()],
-        measure("similar digits", None, first, neighbour_pass(data, context, samples, judges)),
-        measure("true digits", None, first, truth_pass(data, context, judges)),
+        measure("similar digits", None, first, neighbour_scorer(data, context, samples, classifiers)),
+        measure("true digits", None, first, truth_scorer(data, context, classifiers)),
     )
 
 

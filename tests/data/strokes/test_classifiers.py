@@ -12,7 +12,14 @@ from forbes.commands.parsers.data import main
 from forbes.data import Strokes
 from forbes.data.strokes import classifier_training
 from forbes.data.strokes import classifiers as shipped
-from forbes.data.strokes.classifier_training import calibrate, classify, digits_of, draw_finished, fit, quality
+from forbes.data.strokes.classifier_training import (
+    calibrate,
+    classify,
+    digits_of,
+    draw_finished,
+    fit_classifier,
+    quality,
+)
 from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, calibration_error, classifiers_path, load_classifiers
 from forbes.errors import ForbesError
 
@@ -20,7 +27,7 @@ DIGITS = 1000
 
 
 @pytest.fixture(scope="module")
-def judges():
+def classifiers():
     return load_classifiers("bundled")
 
 
@@ -30,18 +37,18 @@ def digits():
     return digits_of(Strokes(), "test").take(torch.arange(DIGITS))
 
 
-def stated(judge, points):
+def stated(network, points):
     """The accuracy that the README states for the bundled strokes."""
     text = classifiers_path().with_name("README.md").read_text("utf-8")
-    (accuracy,) = re.findall(rf"\| {judge} \| bundled \| {points} \| [\d,]+ \| ([\d.]+) % \|", text)
+    (accuracy,) = re.findall(rf"\| {network} \| bundled \| {points} \| [\d,]+ \| ([\d.]+) % \|", text)
     return float(accuracy) / 100
 
 
-@pytest.mark.parametrize(("judge", "points"), [("finished", None), ("prefix", 5), ("prefix", 10), ("prefix", 15)])
-def test_a_classifier_is_as_accurate_as_the_readme_says(judge, points, judges, digits):
-    expected = stated(judge, points or "all")
+@pytest.mark.parametrize(("network", "points"), [("finished", None), ("prefix", 5), ("prefix", 10), ("prefix", 15)])
+def test_a_classifier_is_as_accurate_as_the_readme_says(network, points, classifiers, digits):
+    expected = stated(network, points or "all")
 
-    found = quality(*classify(getattr(judges, judge), digits, points))
+    found = quality(*classify(getattr(classifiers, network), digits, points))
 
     four_errors = 4 * math.sqrt(expected * (1 - expected) / found.digits)
     assert found.accuracy == pytest.approx(expected, abs=four_errors)
@@ -52,8 +59,8 @@ def test_finished_digits_are_told_apart_in_98_of_100_cases():
 
 
 @pytest.mark.parametrize("points", [5, 10, 15])
-def test_a_prefix_classifier_is_right_as_often_as_it_says(points, judges, digits):
-    log_probs, labels = classify(judges.prefix, digits, points)
+def test_a_prefix_classifier_is_right_as_often_as_it_says(points, classifiers, digits):
+    log_probs, labels = classify(classifiers.prefix, digits, points)
 
     confidence, choice = log_probs.double().exp().max(1)
     surplus = (choice == labels).double() - confidence
@@ -98,7 +105,7 @@ def test_what_a_classifier_sees_is_the_last_frame_and_the_mean_of_all():
     torch.testing.assert_close(seen[:, 1:], frames.mean(1))
 
 
-def test_calibration_takes_back_what_was_exaggerated(judges):
+def test_calibration_takes_back_what_was_exaggerated(classifiers):
     validation = digits_of(Strokes(), "validation").take(torch.arange(500))
     classifier = load_classifiers("bundled").prefix
     calibrate(classifier, validation)
@@ -129,7 +136,7 @@ def test_training_learns_and_is_a_function_of_the_seed():
     train = digits_of(source, "train").take(torch.arange(1024))
     test = digits_of(source, "test").take(torch.arange(500))
 
-    one, same, other = (fit(train, draw_finished, 4, seed) for seed in (0, 0, 1))
+    one, same, other = (fit_classifier(train, draw_finished, 4, seed) for seed in (0, 0, 1))
 
     assert quality(*classify(one, test, None)).accuracy > 0.1 + 5 * math.sqrt(0.1 * 0.9 / 500)  # chance
     weights = [torch.cat([values.flatten() for values in net.state_dict().values()]) for net in (one, same, other)]
