@@ -51,4 +51,4 @@ class ImaginedFutures(PictureCallback):
         truth = data.source.pictures(module.model.likelihood.picture(batch.observation))[0]  # (last, C, H, W)
         completions = complete(module.model, data.source, batch, self.context, self.samples)
         futures = completions.frames[:, 0]  # (N, last - context, C, H, W)
-        return imagination.imagined_futures(truth, futures, self.context, self.columns)
+        return imagination.draw_futures(truth, futures, self.context, self.columns)

@@ -12,7 +12,7 @@ from forbes.callbacks.picture import (
 )
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
-from forbes.evaluation.predictions import open_loop
+from forbes.evaluation.predictions import open_loop_frames
 from forbes.figures import imagination
 from forbes.models import StateSpaceModel
 from forbes.training.world_model import WorldModel
@@ -62,5 +62,5 @@ class OpenLoopPanel(PictureCallback):
         assert isinstance(model, StateSpaceModel)
         batch = shown_sequences(data, self.sequences, module)
         truth = data.source.pictures(model.likelihood.picture(batch.observation))  # (B, T, C, H, W)
-        expected = data.source.pictures(open_loop(model, batch, self.context))
-        return imagination.open_loop(truth, expected, batch.mask, self.context, self.columns)
+        expected = data.source.pictures(open_loop_frames(model, batch, self.context))
+        return imagination.draw_open_loop(truth, expected, batch.mask, self.context, self.columns)

@@ -20,7 +20,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record
 from forbes.evaluation.runs import load_runs
-from forbes.figures.comparison import differences, per_step, scores
+from forbes.figures.comparison import draw_differences, draw_per_step, draw_scores
 from forbes.figures.style import save_figure
 from forbes.files import replace_file
 from forbes.runs.checkpoint import open_checkpoint
@@ -153,11 +153,11 @@ def _write(comparison: Comparison, families: Sequence[Family], folder: Path, com
     replace_file(folder / "comparison.csv", comparison.scores.to_csv(index=False).encode())
     replace_file(folder / "comparison.json", (json.dumps(record, indent=2) + "\n").encode())
     replace_file(folder / "comparison.md", text.encode())
-    figures = {"scores": scores(comparison)}
-    if steps := per_step(comparison):
+    figures = {"scores": draw_scores(comparison)}
+    if steps := draw_per_step(comparison):
         figures["per-step"] = steps
     if len(comparison.differences):
-        figures["differences"] = differences(comparison, families[0].name)
+        figures["differences"] = draw_differences(comparison, families[0].name)
     for name, figure in figures.items():
         for suffix in (".png", ".pdf"):
             save_figure(figure, folder / f"{name}{suffix}")

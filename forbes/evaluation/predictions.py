@@ -10,7 +10,7 @@ from forbes.errors import ForbesError
 from forbes.models import BeliefModel, Rollout, State, StateSpaceModel
 from forbes.shapes import printed_by_shape
 
-__all__ = ["Completions", "complete", "filter", "first_of_each_class", "imagine", "open_loop", "whole_sequences"]
+__all__ = ["Completions", "complete", "filter", "first_of_each_class", "imagine", "open_loop_frames", "whole_sequences"]
 
 
 @printed_by_shape
@@ -124,7 +124,7 @@ def complete(
 
 
 @torch.no_grad()
-def open_loop(model: StateSpaceModel, batch: SequenceBatch, context: int) -> Tensor:
+def open_loop_frames(model: StateSpaceModel, batch: SequenceBatch, context: int) -> Tensor:
     """Return E[o_t | features] in [0, 1], `(B, T, C, H, W)`, along one trajectory of each sequence.
 
     Up to `context` the features are the posterior's, given o_t. Later ones are a rollout of the prior from the belief

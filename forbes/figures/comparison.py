@@ -13,14 +13,14 @@ from forbes.evaluation.comparison import Comparison
 from forbes.evaluation.metrics import SCORES, score_of
 from forbes.figures.style import COLUMN, GREY, PAGE, PALETTE, draw_references, paper_style
 
-__all__ = ["differences", "per_step", "scores"]
+__all__ = ["draw_differences", "draw_per_step", "draw_scores"]
 
 _PER_STEP = ("elbo", "pll", "open_loop_marginal", "degradation", "ess")
 """Scores that are meaningful at a single step."""
 _FAR = 5  # distance of an outlier, in multiples of the range of the other families
 
 
-def scores(comparison: Comparison) -> Figure:
+def draw_scores(comparison: Comparison) -> Figure:
     """Draw each score in a panel: one dot per seed with its standard error, and a bar at the mean over seeds.
 
     The line of a family without the score stays empty. A family far below the others is not drawn to scale: its mean is
@@ -80,7 +80,7 @@ def _near(means: pd.Series) -> list[str]:
     return list(ordered.index)
 
 
-def per_step(comparison: Comparison) -> Figure | None:
+def draw_per_step(comparison: Comparison) -> Figure | None:
     """Draw the mean at each step over sequences and seeds, one panel per score; None if no score has steps."""
     metrics = [metric for metric in comparison.curves if score_of(metric) in _PER_STEP]
     if not metrics:
@@ -111,7 +111,7 @@ def _draw_steps(axes: Axes, curves: dict[str, list[float]], metric: str, colours
     axes.set_ylabel("fraction of K" if score_of(metric) == "ess" else "nats")
 
 
-def differences(comparison: Comparison, first: str) -> Figure:
+def draw_differences(comparison: Comparison, first: str) -> Figure:
     """Draw the mean difference to the first family as a table of families and scores, coloured within each column.
 
     A cell is n/a if one of the two families does not have the score.

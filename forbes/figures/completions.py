@@ -21,7 +21,7 @@ from forbes.figures.style import BLACK, GREY, PAGE, PALETTE, paper_style
 from forbes.models import BeliefModel
 from forbes.seeding import derive_seed
 
-__all__ = ["by_ambiguity", "drawings", "errors", "scores"]
+__all__ = ["by_ambiguity", "draw_class_scores", "draw_completions", "draw_errors"]
 
 _SHOWN = 5
 """Number of completions drawn per digit."""
@@ -46,7 +46,7 @@ def by_ambiguity(reference: Tensor, count: int) -> Tensor:
     return order[torch.linspace(0, len(order) - 1, min(count, len(order))).round().long()]
 
 
-def drawings(
+def draw_completions(
     study: Study,
     models: Sequence[BeliefModel],
     source: SequenceSource,
@@ -72,7 +72,7 @@ def drawings(
     truth, seen = (pictures[digit, step - 1][:, None].float() for step in (end, torch.full_like(end, context)))
     reference = study.reference.classes[place].numpy()  # (R, 10)
     ambiguity = [f"H = {value:.2f}" for value in study.reference.scores["entropy[end]"][place].tolist()]
-    beginnings: list[Panel | Bars] = [
+    prefix_panels: list[Panel | Bars] = [
         Panel("truth", truth, BLACK, ["end"]),
         Panel("seen", seen, GREY, [f"t={context}"]),
         Bars("reference", reference, GREY, notes=ambiguity),
@@ -87,10 +87,10 @@ def drawings(
         classes = Bars("their classes", row.classes[place].numpy(), colour, reference, notes)
         of_models.append([Panel(row.name, frames.transpose(0, 1), colour), classes])
     pairs = [of_models[first : first + _SIDE_BY_SIDE] for first in range(0, len(of_models), _SIDE_BY_SIDE)]
-    return draw_bands([[*beginnings, *chain(*pair)] for pair in pairs])
+    return draw_bands([[*prefix_panels, *chain(*pair)] for pair in pairs])
 
 
-def scores(studies: Sequence[Study]) -> Figure:
+def draw_class_scores(studies: Sequence[Study]) -> Figure:
     """Draw scores of the class against the length of the prefix, with standard errors over digits."""
     with paper_style():
         figure = Figure((PAGE, 2.1), layout="constrained")
@@ -117,7 +117,7 @@ def _draw_line(axes: Axes, studies: Sequence[Study], rows: Sequence[Row], score:
     axes.errorbar(steps, means, widths, fmt=f".{line}", color=colour, label=rows[0].name, capsize=2, markersize=3)
 
 
-def errors(studies: Sequence[Study]) -> Figure:
+def draw_errors(studies: Sequence[Study]) -> Figure:
     """Draw the error of the best of n completions (solid) and of their average image (dashed) against n."""
     with paper_style():
         figure = Figure((PAGE, 2.3), layout="constrained")

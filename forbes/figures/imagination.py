@@ -9,10 +9,10 @@ from torch import Tensor
 from forbes.figures.grids import Panel, draw_bands
 from forbes.figures.style import BLACK, BLUE, GREY
 
-__all__ = ["imagined_futures", "open_loop"]
+__all__ = ["draw_futures", "draw_open_loop"]
 
 
-def open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, columns: int) -> Figure:
+def draw_open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, columns: int) -> Figure:
     r"""Draw truth, model and error of some sequences over time, for observed and imagined frames.
 
     .. math:: \text{error} = \tfrac12 + \tfrac12 (\text{model} - \text{truth})
@@ -44,7 +44,7 @@ def open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, columns:
     return draw_bands(bands)
 
 
-def imagined_futures(truth: Tensor, futures: Tensor, context: int, columns: int) -> Figure:
+def draw_futures(truth: Tensor, futures: Tensor, context: int, columns: int) -> Figure:
     """Draw a sequence and, below it, N futures imagined from one belief, with the same past.
 
     Args:

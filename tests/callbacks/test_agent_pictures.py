@@ -14,8 +14,8 @@ from small_agents import fit, write_image_config
 
 from forbes.callbacks import EpisodeVideo, ImaginedFutures, OpenLoopPanel, ReturnCurve
 from forbes.callbacks.picture import shown_sequences
-from forbes.evaluation.predictions import open_loop
-from forbes.figures.imagination import imagined_futures
+from forbes.evaluation.predictions import open_loop_frames
+from forbes.figures.imagination import draw_futures
 from forbes.figures.returns import published_curves, return_curve
 from forbes.figures.video import gif
 from forbes.runs.checkpoint import read_checkpoint
@@ -89,7 +89,7 @@ def test_the_frames_seen_are_reconstructed_and_later_observations_change_nothing
     outputs = []
     for each in (batch, other, batch._replace(action=-batch.action)):
         torch.manual_seed(3)
-        outputs.append(open_loop(model, each, context=2))
+        outputs.append(open_loop_frames(model, each, context=2))
     torch.manual_seed(3)
     with torch.no_grad():
         filtered = model.filter(model.embed(batch.observation[:, :2]), batch.action[:, :2])
@@ -116,7 +116,7 @@ def test_the_panel_shows_truth_model_and_half_their_difference_around_grey(train
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["truth", "model", "error"]
     assert [label.get_text() for label in figure.axes[3].get_xticklabels()] == ["t=3", "t=5"]
     torch.manual_seed(0)
-    expected = open_loop(module.model, batch, 2)
+    expected = open_loop_frames(module.model, batch, 2)
     for number in range(2):
         for axes, times in zip(figure.axes[2 * number :], ([0, 1], [2, 4]), strict=False):
             truth, model, error = cells(axes, 2)  # each (2, H, W, 3)
@@ -157,7 +157,7 @@ def test_a_future_stands_at_its_own_step():
     """A frame whose grey is its time, counted from 1, out of 20."""
     time = torch.arange(1, 21).view(20, 1, 1, 1).expand(20, 3, 8, 8) / 20
 
-    figure = imagined_futures(time, time[5:].expand(2, -1, -1, -1, -1), context=5, columns=4)
+    figure = draw_futures(time, time[5:].expand(2, -1, -1, -1, -1), context=5, columns=4)
 
     labels = [int(label.get_text()[2:]) for axes in figure.axes[2:] for label in axes.get_xticklabels()]
     assert labels == [2, 4, 5, 6, 11, 15, 20]
