@@ -8,8 +8,8 @@ import pytest
 FORBES = Path(__file__).parents[1] / "forbes"
 MODULES = sorted(FORBES.rglob("*.py"))
 
-FOUNDATION = ["errors", "files", "reading", "child", "choices", "configured", "frozen", "named", "seeding", "shapes"]
-FOUNDATION += ["signatures"]
+FOUNDATION = ["errors", "files", "reading", "child", "choices", "configured", "frozen", "named", "rounding", "seeding"]
+FOUNDATION += ["shapes", "signatures"]
 PACKAGES = ["performance", "beliefs", "models", "control", "pomdps", "envs", "data", "runs", "training", "evaluation"]
 PACKAGES += ["figures", "callbacks", "commands"]
 LINE = [*FOUNDATION, *PACKAGES, "__main__", "__init__"]

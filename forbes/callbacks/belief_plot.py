@@ -15,7 +15,7 @@ from matplotlib.transforms import blended_transform_factory
 from torch import Tensor
 
 from forbes.beliefs import BeliefHead
-from forbes.callbacks.picture import PictureCallback, require_state, to_device
+from forbes.callbacks.picture import PictureCallback, require_state
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import first_of_each_class
@@ -62,7 +62,7 @@ class BeliefPlot(PictureCallback):
         model = module.model
         assert isinstance(model, StateSpaceModel)
         index = first_of_each_class(data, "validation", self.digits)
-        batch = to_device(data.sequences("validation", index), module)
+        batch = data.sequences("validation", index).to(module.device)
         pictures = data.source.pictures(batch.observation)
         filtered = model.filter(model.embed(batch.observation), batch.action)
         prior_context = model.prior_context(filtered.hidden)  # (B, T, C)

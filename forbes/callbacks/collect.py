@@ -11,6 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from forbes.data import Experience
+from forbes.data.datamodule import datamodule_of
 from forbes.data.episodes.collection import random_policy
 from forbes.data.episodes.episode import Episode
 from forbes.errors import ForbesError
@@ -77,7 +78,7 @@ class Collect(Callback):
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Close them after an error, too."""
-        if isinstance(source := trainer.datamodule.source, Experience):  # type: ignore[attr-defined]
+        if isinstance(source := datamodule_of(trainer).source, Experience):
             source.close()
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -157,13 +158,12 @@ def _eval_mode(agent: WorldModelAgent) -> Iterator[None]:
 
 
 def _experience(trainer: Trainer) -> Experience:
-    source: Experience = trainer.datamodule.source  # type: ignore[attr-defined]
-    return source
+    return cast(Experience, datamodule_of(trainer).source)
 
 
 def require_agent(callback: Callback, trainer: Trainer, module: LightningModule) -> None:
     """Raise a ForbesError unless an agent learns on Experience."""
-    source = trainer.datamodule.source  # type: ignore[attr-defined]
+    source = datamodule_of(trainer).source
     if not (isinstance(source, Experience) and isinstance(module, WorldModelAgent)):
         name, found = type(callback).__name__, f"{type(module).__name__} on {type(source).__name__}"
         raise ForbesError(f"{name}: found a {found}, expected an agent on Experience. Remove it, or change them")

@@ -8,7 +8,8 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from forbes.data import SequenceDataModule
+from forbes.data.datamodule import datamodule_of
+from forbes.rounding import ceil_div
 from forbes.runs.checkpoint import AtomicCheckpointIO
 from forbes.runs.folder import RunFolder
 from forbes.training.divergence import DivergedError, hold_unless_finite
@@ -78,7 +79,7 @@ class StopAtDivergence(Callback):
 
 def _failure_record(trainer: Trainer, module: LightningModule, update: int) -> dict[str, Any]:
     """Return plain values and tensors from which the update can be recomputed, with the weights before it."""
-    data: SequenceDataModule = trainer.datamodule  # type: ignore[attr-defined]
+    data = datamodule_of(trainer)
     numbers = _batches_of(update, int(trainer.num_training_batches), trainer.accumulate_grad_batches)
     drawn: Sequence[int] = numbers
     if trainer.overfit_batches:  # type: ignore[attr-defined]  # all epochs have the same batches
@@ -97,6 +98,6 @@ def _failure_record(trainer: Trainer, module: LightningModule, update: int) -> d
 
 def _batches_of(update: int, per_epoch: int, per_update: int) -> range:
     """Return the numbers of the batches of an update. The last update of an epoch may have fewer batches."""
-    epoch, in_epoch = divmod(update, -(-per_epoch // per_update))
+    epoch, in_epoch = divmod(update, ceil_div(per_epoch, per_update))
     first = in_epoch * per_update
     return range(epoch * per_epoch + first, epoch * per_epoch + min(first + per_update, per_epoch))

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.callbacks.picture import PictureCallback, to_device
+from forbes.callbacks.picture import PictureCallback
 from forbes.data import SequenceDataModule
 from forbes.evaluation.references import reference_means
 from forbes.figures.style import BLACK, BLUE, GREY, PAGE, draw_references, paper_style, show_settled
@@ -63,7 +63,7 @@ class ElboCurve(PictureCallback):
     def _kl_per_step(self, module: WorldModel, data: SequenceDataModule) -> tuple[Tensor, Tensor]:
         """Return mean and standard error over sequences of the KL at each step, each `(T,)`."""
         index = torch.arange(min(self.sequences, data.source.size("validation")))
-        batches = [to_device(data.sequences("validation", part), module) for part in index.split(data.batch_size)]
+        batches = [data.sequences("validation", part).to(module.device) for part in index.split(data.batch_size)]
         terms = [module.terms(batch) for batch in batches]
         kl = torch.cat([term.kl.masked_fill(~term.mask, torch.nan) for term in terms]).cpu()  # (B, T)
         count = kl.isfinite().sum(0)

@@ -4,7 +4,7 @@ from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
 from forbes.callbacks.picture import PictureCallback, require_context, require_frames, shown_sequences
-from forbes.data import SequenceBatch, SequenceDataModule
+from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import complete
 from forbes.figures import imagination
@@ -47,7 +47,7 @@ class ImaginedFutures(PictureCallback):
         """Draw the sequence and the futures."""
         batch = shown_sequences(data, 1, module)
         last = max(self.context + 1, int(batch.mask.sum()))
-        batch = SequenceBatch(*(values[:, :last] for values in batch))  # (1, last, ...)
+        batch = batch.first(last)  # (1, last, ...)
         truth = data.source.pictures(module.model.likelihood.picture(batch.observation))[0]  # (last, C, H, W)
         completions = complete(module.model, data.source, batch, self.context, self.samples)
         futures = completions.frames[:, 0]  # (N, last - context, C, H, W)

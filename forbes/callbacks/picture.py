@@ -11,12 +11,13 @@ from lightning import Callback, LightningModule, Trainer
 from matplotlib.figure import Figure
 
 from forbes.data import SequenceBatch, SequenceDataModule
+from forbes.data.datamodule import datamodule_of
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import first_of_each_class
 from forbes.figures.grids import require_images
 from forbes.figures.style import save_figure
 from forbes.models import StateSpaceModel
-from forbes.seeding import derive_seed
+from forbes.seeding import derive_seed, forked
 from forbes.training.world_model import WorldModel
 
 __all__ = [
@@ -26,7 +27,6 @@ __all__ = [
     "require_frames",
     "require_state",
     "shown_sequences",
-    "to_device",
 ]
 
 
@@ -66,8 +66,8 @@ class FileCallback(Callback, ABC):
         if folder is None or not trainer.is_global_zero:
             return
         with _own_randomness(module, self.filename):
-            data = trainer.datamodule  # type: ignore[attr-defined]
-            self.write(trainer, cast(WorldModel, module), data, Path(folder) / "figures" / self.filename)
+            path = Path(folder) / "figures" / self.filename
+            self.write(trainer, cast(WorldModel, module), datamodule_of(trainer), path)
 
 
 class PictureCallback(FileCallback):
@@ -86,17 +86,10 @@ class PictureCallback(FileCallback):
 def _own_randomness(module: LightningModule, purpose: str) -> Iterator[None]:
     """Compute in eval mode, without gradients and with a separate random seed; restore all three afterwards."""
     training = module.training
-    cuda = [module.device] if module.device.type == "cuda" else []
-    with torch.no_grad(), torch.random.fork_rng(cuda):
-        torch.manual_seed(derive_seed(0, purpose, 0))
+    with torch.no_grad(), forked(module.device, derive_seed(0, purpose, 0)):
         module.eval()
         yield
         module.train(training)
-
-
-def to_device(batch: SequenceBatch, module: LightningModule) -> SequenceBatch:
-    """Move a batch to the module's device."""
-    return SequenceBatch(*(values.to(module.device) for values in batch))
 
 
 def shown_sequences(data: SequenceDataModule, count: int, module: LightningModule) -> SequenceBatch:
@@ -109,12 +102,12 @@ def shown_sequences(data: SequenceDataModule, count: int, module: LightningModul
         batch = data.sequences("validation", first_of_each_class(data, "validation", count))
     else:
         batch = data.sequences("train", data.source.latest(count))
-    return to_device(batch, module)
+    return batch.to(module.device)
 
 
 def require_context(callback: Callback, trainer: Trainer, context: int) -> None:
     """Raise a ForbesError unless the context is shorter than the sequences."""
-    length = trainer.datamodule.length  # type: ignore[attr-defined]  # Lightning gives it no type
+    length = datamodule_of(trainer).length
     if context >= length:
         name = type(callback).__name__
         raise ForbesError(f"{name}: context is {context}, expected less than the length {length}. Choose a smaller one")
@@ -130,5 +123,5 @@ def require_state(callback: Callback, module: LightningModule) -> None:
 
 def require_frames(callback: Callback, trainer: Trainer) -> None:
     """Raise a ForbesError unless the observations are images."""
-    shape = trainer.datamodule.observation_shape  # type: ignore[attr-defined]
+    shape = datamodule_of(trainer).observation_shape
     require_images(type(callback).__name__, shape, "Remove this callback, or observe pixels")

@@ -3,7 +3,7 @@
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.callbacks.picture import PictureCallback, require_context, require_frames, to_device
+from forbes.callbacks.picture import PictureCallback, require_context, require_frames
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
@@ -45,7 +45,7 @@ class PredictionGrid(PictureCallback):
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """Draw the digits and their completions."""
         index = first_of_each_class(data, "validation", self.digits)
-        batch = to_device(whole_sequences(data, "validation", index), module)
+        batch = whole_sequences(data, "validation", index).to(module.device)
         times = sorted({data.length, batch.observation.shape[1]})
         completions = complete(module.model, data.source, batch, self.context, self.samples)
         sampled = [

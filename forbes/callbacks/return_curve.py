@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from forbes.callbacks.collect import require_agent
 from forbes.callbacks.picture import PictureCallback
 from forbes.data import Experience, SequenceDataModule
+from forbes.data.datamodule import datamodule_of
 from forbes.figures.returns import published_curves, return_curve
 from forbes.runs.folder import read_metrics
 from forbes.training.world_model import WorldModel
@@ -37,7 +38,7 @@ class ReturnCurve(PictureCallback):
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Refuse models and files that cannot be drawn when the training starts."""
         require_agent(self, trainer, pl_module)
-        self._published(trainer.datamodule)  # type: ignore[attr-defined]  # Lightning gives it no type
+        self._published(datamodule_of(trainer))
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """Draw the returns."""

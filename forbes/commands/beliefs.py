@@ -1,17 +1,15 @@
 """`forbes beliefs`: compare learned beliefs of a known process with the exact ones."""
 
-import sys
 import time
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import torch
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
+from forbes.commands.console import console
 from forbes.commands.parsers.beliefs import parser
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.errors import ForbesError
@@ -22,8 +20,8 @@ from forbes.evaluation.runs import data_name, data_sha256, split_batches
 from forbes.evaluation.scores import Increments
 from forbes.evaluation.scoring import Scores, require_finite, with_progress
 from forbes.pomdps import ExactFilter
-from forbes.runs.provenance import command_line, commit
-from forbes.seeding import derive_seed, generator
+from forbes.runs.provenance import command_line, origin
+from forbes.seeding import derive_seed, forked, generator
 from forbes.training import KnownBelief
 from forbes.training.known_belief import has_transition_density
 from forbes.training.loading import load_known_belief
@@ -54,21 +52,17 @@ def main(argv: Sequence[str]) -> None:
     for run in runs:
         began = time.monotonic()
         scores = _learned(run, args)
-        origin = {
-            "command": command_line("beliefs", *argv),
-            "commit": commit(),
-            "seed": args.seed,
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        about = origin(command_line("beliefs", *argv), args.seed) | {
             "data": {"name": data_name(run.data), "sha256": sha256},
             "checkpoint": run.checkpoint,
             "seconds": round(time.monotonic() - began, 1),
         }
         names = {metric: _metric_name(run, args, metric) for metric in scores.values}
-        entries = {name: _describe(scores, metric) | origin for metric, name in names.items()}
+        entries = {name: _describe(scores, metric) | about for metric, name in names.items()}
         write_record(folders[run.path], entries, {name: scores.values[metric].sum(1) for metric, name in names.items()})
         table.add_row(*_row(run.path, f"{type(run.module.model.head).__name__}, {run.module.objective}", scores))
     table.add_row(*_row("", "moment-matched Gaussian", _matched(runs[0], args)))
-    Console(width=None if sys.stdout.isatty() else 200).print(table)
+    console(200).print(table)
 
 
 def _load(path: str) -> _Run:
@@ -98,15 +92,14 @@ def _same_data(runs: Sequence[_Run], args: Any) -> str:
 def _score(run: _Run, args: Any, name: str, compare: Callable[[int, SequenceBatch, ExactFilter], Increments]) -> Scores:
     """Compare beliefs with the exact ones, batch by batch, all in float64."""
     parts, masks = [], []
-    with torch.random.fork_rng([]), torch.no_grad():
-        batches = split_batches(run.data, args.split, args.sequences, _ROWS)
-        for first, batch in with_progress(batches, f"{run.path} {name}", args.sequences):
-            observation, action, state = batch.observation.double(), batch.action.double(), batch.state.double()
-            exact = run.module.process.exact_filter(observation, action)
-            torch.manual_seed(derive_seed(args.seed, "beliefs", first))
-            batch = batch._replace(observation=observation, action=action, state=state)
+    batches = split_batches(run.data, args.split, args.sequences, _ROWS)
+    for first, batch in with_progress(batches, f"{run.path} {name}", args.sequences):
+        observation, action, state = batch.observation.double(), batch.action.double(), batch.state.double()
+        exact = run.module.process.exact_filter(observation, action)
+        batch = batch._replace(observation=observation, action=action, state=state)
+        with forked("cpu", derive_seed(args.seed, "beliefs", first)), torch.no_grad():
             parts.append(compare(first, batch, exact))
-            masks.append(batch.mask)
+        masks.append(batch.mask)
     return Scores({name: torch.cat([part[name] for part in parts]) for name in parts[0]}, torch.cat(masks))
 
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import pandas as pd
 import yaml
-from rich.console import Console
 from rich.markdown import Markdown
 
+from forbes.commands.console import console
 from forbes.commands.evaluate import evaluate, wanted_metrics
 from forbes.commands.jobs import Job, run_jobs
 from forbes.commands.parsers.compare import parser
@@ -21,7 +21,7 @@ from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record
 from forbes.evaluation.runs import load_runs
 from forbes.figures.comparison import draw_differences, draw_per_step, draw_scores
-from forbes.figures.style import save_figure
+from forbes.figures.style import save_png_and_pdf
 from forbes.files import replace_file
 from forbes.runs.checkpoint import open_checkpoint
 from forbes.runs.configuration import allowed_modules
@@ -159,9 +159,8 @@ def _write(comparison: Comparison, families: Sequence[Family], folder: Path, com
     if len(comparison.differences):
         figures["differences"] = draw_differences(comparison, families[0].name)
     for name, figure in figures.items():
-        for suffix in (".png", ".pdf"):
-            save_figure(figure, folder / f"{name}{suffix}")
-    Console(width=None if sys.stdout.isatty() else 200).print(Markdown(text))
+        save_png_and_pdf(figure, folder, name)
+    console(200).print(Markdown(text))
     print(f"comparison.csv, .json, .md and {', '.join(figures)} are in {folder}")
 
 

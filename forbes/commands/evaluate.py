@@ -4,7 +4,6 @@ import itertools
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,7 +31,7 @@ from forbes.evaluation.runs import (
     split_batches,
 )
 from forbes.evaluation.scoring import PartialScores, Scorer, exact_scorer, make_scorer, score_split, with_progress
-from forbes.runs.provenance import command_line, commit
+from forbes.runs.provenance import command_line, origin
 
 __all__ = ["evaluate", "main", "wanted_metrics"]
 
@@ -90,8 +89,7 @@ def evaluate(
             finished.append(_measure(one, job, job.sha256[number], args, folders[run.path]))
         _add_references(one, jobs, args.split)
         for entry in one.entries.values():
-            date = datetime.now(UTC).isoformat(timespec="seconds")
-            entry.update(command=command, commit=commit(), seed=args.seed, date=date, parameters=run.parameters)
+            entry.update(origin(command, args.seed), parameters=run.parameters)
         measured.append(one)
     for first, second, differences in compare_pairs(measured):
         record_differences(first, second, differences)

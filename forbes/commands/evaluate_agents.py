@@ -1,13 +1,12 @@
 """The tables that `forbes evaluate` prints for agents."""
 
 import itertools
-import sys
 from collections.abc import Sequence
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from forbes.commands.console import console
 from forbes.evaluation.agents import DISTANCES, REWARD, PlayedAgent
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.reward_prediction import STEPS_AHEAD
@@ -17,7 +16,7 @@ __all__ = ["print_agents"]
 
 def print_agents(played: Sequence[PlayedAgent]) -> None:
     """Print the returns, the reward predictions, the measures of the beliefs, and all paired differences."""
-    console = Console(width=None if sys.stdout.isatty() else 160)
+    screen = console(160)
     episodes, how = len(played[0].returns), "undiscounted, mean ± standard error; the same episodes for all"
     table = Table(title=f"return in {episodes} episodes, by the mean action of K trajectories of the belief: {how}")
     for header in ("run", "agent", "parameters", "K", "return", "lowest", "highest"):
@@ -28,13 +27,13 @@ def print_agents(played: Sequence[PlayedAgent]) -> None:
         kind = f"{type(one.agent).__name__}, {type(one.agent.model.posterior).__name__}"
         samples = str(one.agent.acting_samples)
         table.add_row(escape(one.run), kind, f"{size:,}", samples, str(Estimate.of(one.returns)), *ends)
-    console.print(table)
-    console.print(_reward_prediction(played))
+    screen.print(table)
+    screen.print(_reward_prediction(played))
     if any(one.belief for one in played):
-        console.print(_beliefs(played))
+        screen.print(_beliefs(played))
     for first, second in itertools.combinations(played, 2):
         difference = Estimate.of(first.returns - second.returns)
-        console.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
+        screen.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
 
 
 def _reward_prediction(played: Sequence[PlayedAgent]) -> Table:

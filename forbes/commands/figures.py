@@ -19,12 +19,10 @@ from forbes.evaluation.references import reference_means
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
 from forbes.figures.returns import returns_against_env_steps
 from forbes.figures.strokes import FamilyCurves, ambiguous_digits, elbo_against_updates, predictions
-from forbes.figures.style import PALETTE, save_figure
+from forbes.figures.style import PALETTE, save_png_and_pdf
 from forbes.runs.folder import RunFolder, read_config, read_metrics
 
 __all__ = ["main"]
-
-_FORMATS = (".png", ".pdf")
 
 
 def main(argv: Sequence[str]) -> None:
@@ -129,6 +127,4 @@ def _index(index: Sequence[int], size: int) -> torch.Tensor:
 
 
 def _save(figure: Figure, folder: Path, name: str) -> None:
-    for suffix in _FORMATS:
-        save_figure(figure, folder / f"{name}{suffix}")
-        print(folder / f"{name}{suffix}")
+    print(*save_png_and_pdf(figure, folder, name), sep="\n")

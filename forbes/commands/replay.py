@@ -69,10 +69,9 @@ def first_not_finite(module: WorldModel | KnownBelief, failure: Mapping[str, Any
     module.to(device).train()
     watch = _Watch(module)
     for number, content in zip(failure["batch_numbers"], failure["batches"], strict=True):
-        batch = SequenceBatch(**content)
-        for name, values in batch._asdict().items():
+        for name, values in content.items():
             watch.look(f"{name} of batch {number}", values)
-        batch = SequenceBatch(*(values.to(device) for values in batch))
+        batch = SequenceBatch(**content).to(device)
         _stand_before(module, failure["update"], number)
         module.on_train_batch_start(batch, batch_idx=1)  # seeds the noise; index 0 would check the data of an epoch
         with torch.autocast(device, torch.bfloat16, enabled=failure["precision"].startswith("bf16")):

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,27 +9,25 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from forbes.commands.console import console
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.metrics import EvaluatedRun, Pair, at_horizons, degradation
 from forbes.evaluation.references import lowest_above
 
 __all__ = ["beaten_by", "print_degradation", "print_pairs", "print_references", "print_runs"]
 
-_PIPE = 200
-"""Columns where there is no terminal: rich would take 80."""
-
 
 def print_runs(measured: Sequence[EvaluatedRun]) -> None:
     """Print every metric of every run; n/a if its model does not have it."""
-    console = _console()
+    screen = console(200)
     for number, one in enumerate(measured, start=1):
         text = f"{number}  {escape(one.run.path)}: {one.run.family}, {one.run.parameters:,} parameters"
-        console.print(text, soft_wrap=True)
+        screen.print(text, soft_wrap=True)
     columns = {
         str(number): {name: _cell(name, entry) for name, entry in one.entries.items()}
         for number, one in enumerate(measured, start=1)
     }
-    _print(console, "nats per sequence, mean ± standard error; ess as a fraction of K", columns)
+    _print(screen, "nats per sequence, mean ± standard error; ess as a fraction of K", columns)
 
 
 def print_references(measured: Sequence[EvaluatedRun]) -> None:
@@ -41,12 +38,12 @@ def print_references(measured: Sequence[EvaluatedRun]) -> None:
             columns.setdefault(reference, {})[name] = str(_estimate(estimate))
     if not columns:
         return
-    console = _console()
-    _print(console, "log p of the same steps under models without a belief, nats per sequence", columns)
+    screen = console(200)
+    _print(screen, "log p of the same steps under models without a belief, nats per sequence", columns)
     below = [one.run.path for one in measured if any(beaten_by(entry) for entry in one.entries.values())]
     if below:
         text = f"<: below this reference, so the model has learned less than it: {escape(', '.join(below))}"
-        console.print(text, soft_wrap=True)
+        screen.print(text, soft_wrap=True)
 
 
 def beaten_by(entry: Mapping[str, Any]) -> str | None:
@@ -63,7 +60,7 @@ def print_pairs(pairs: Sequence[Pair]) -> None:
         }
         for first, second, differences in pairs
     }
-    _print(_console(), "paired differences over the same sequences, nats per sequence (in standard errors)", columns)
+    _print(console(200), "paired differences over the same sequences, nats per sequence (in standard errors)", columns)
 
 
 def print_degradation(measured: Sequence[EvaluatedRun]) -> None:
@@ -79,18 +76,18 @@ def print_degradation(measured: Sequence[EvaluatedRun]) -> None:
             numbers[path]: {f"{horizon} steps": f"{loss:.2f}" for horizon, loss in row.items()}
             for path, row in rows.items()
         }
-        _print(_console(), f"{metric}: nats that a prediction loses, by steps after the last observation", columns)
+        _print(console(200), f"{metric}: nats that a prediction loses, by steps after the last observation", columns)
 
 
-def _print(console: Console, title: str, columns: Mapping[str, Mapping[str, str]]) -> None:
+def _print(screen: Console, title: str, columns: Mapping[str, Mapping[str, str]]) -> None:
     """Print a table with named rows; if it is wider than the console, split its columns into several tables."""
     names = [(name, _in_lines(name)) for name in _union(columns.values())]
-    room = console.width - max((len(line) for _, lines in names for line in lines.split("\n")), default=0) - 4
+    room = screen.width - max((len(line) for _, lines in names for line in lines.split("\n")), default=0) - 4
     widths = {
         header: max(len(line) for cell in (header, *cells.values()) for line in cell.split("\n")) + 3
         for header, cells in columns.items()
     }
-    console.print(f"\n{escape(title)}", soft_wrap=True)
+    screen.print(f"\n{escape(title)}", soft_wrap=True)
     for headers in _fitting(widths, room):
         table = Table()
         table.add_column("score", no_wrap=True)
@@ -98,7 +95,7 @@ def _print(console: Console, title: str, columns: Mapping[str, Mapping[str, str]
             table.add_column(escape(header), justify="right", no_wrap=True)
         for name, lines in names:
             table.add_row(escape(lines), *(escape(columns[header].get(name, "n/a")) for header in headers))
-        console.print(table)
+        screen.print(table)
 
 
 def _fitting(widths: Mapping[str, int], room: int) -> Iterator[list[str]]:
@@ -111,10 +108,6 @@ def _fitting(widths: Mapping[str, int], room: int) -> Iterator[list[str]]:
         group.append(header)
     if group:
         yield group
-
-
-def _console() -> Console:
-    return Console(width=None if sys.stdout.isatty() else _PIPE)
 
 
 def _in_lines(name: str) -> str:

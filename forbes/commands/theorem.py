@@ -1,12 +1,11 @@
 """`forbes theorem`: Theorem 1 on linear-Gaussian processes, and why a higher ELBO is not a better belief."""
 
 import argparse
-import sys
 from collections.abc import Callable, Mapping, Sequence
 
-from rich.console import Console
 from rich.table import Table
 
+from forbes.commands.console import console
 from forbes.commands.parsers.theorem import parser
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
@@ -58,10 +57,10 @@ def main(argv: Sequence[str]) -> None:
         most = _MAX_SAMPLES // args.steps
         raise ForbesError(f"--samples {args.samples}: expected at most {most} with {args.steps} steps")
     processes = _processes(args)
-    console = Console(width=None if sys.stdout.isatty() else 160)  # into a file, rich would fold at 80
-    console.print(_identity(processes, args.samples, args.seed), _IDENTITY, "", sep="\n", highlight=False)
-    console.print(_beliefs(processes), _BELIEFS, "", sep="\n", highlight=False)
-    console.print(_scan(processes), _SCAN, sep="\n", highlight=False)
+    screen = console(160)
+    screen.print(_identity(processes, args.samples, args.seed), _IDENTITY, "", sep="\n", highlight=False)
+    screen.print(_beliefs(processes), _BELIEFS, "", sep="\n", highlight=False)
+    screen.print(_scan(processes), _SCAN, sep="\n", highlight=False)
 
 
 def _processes(args: argparse.Namespace) -> list[ClosedFormProcess]:

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch, check_source
 from forbes.errors import ForbesError
 
-__all__ = ["SequenceDataModule"]
+__all__ = ["SequenceDataModule", "datamodule_of"]
 
 
 class _Batches(IterableDataset[Any]):
@@ -47,6 +47,12 @@ def _batches_taken(trainer: Trainer) -> int:
     """Return the number of training batches so far; with `overfit_batches`, those of this epoch only."""
     loop, same = trainer.fit_loop, trainer.overfit_batches  # type: ignore[attr-defined]  # set by a helper of Lightning
     return 1 + (loop.batch_idx if same else loop.total_batch_idx)
+
+
+def datamodule_of(trainer: Trainer) -> "SequenceDataModule":
+    """Return the data module of a trainer, an attribute that Lightning does not declare."""
+    data: SequenceDataModule = trainer.datamodule  # type: ignore[attr-defined]
+    return data
 
 
 class SequenceDataModule(LightningDataModule):

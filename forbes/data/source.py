@@ -43,6 +43,18 @@ class SequenceBatch(NamedTuple):
     ended: Tensor
     """True at the step where the process terminated (not truncated by a time limit), bool (B, T)."""
 
+    def to(self, device: torch.device | str) -> "SequenceBatch":
+        """Move the batch to a device."""
+        return SequenceBatch(*(values.to(device) for values in self))
+
+    def first(self, steps: int) -> "SequenceBatch":
+        """Return the first steps of all sequences, `(B, steps, ...)`."""
+        return SequenceBatch(*(values[:, :steps] for values in self))
+
+    def rows(self, rows: slice) -> "SequenceBatch":
+        """Return some of the sequences."""
+        return SequenceBatch(*(values[rows] for values in self))
+
 
 class SequenceSource(Named, ABC):
     """A set of sequences. To add one, copy `strokes/source.py`: four methods and two attributes.

@@ -31,7 +31,8 @@ from forbes.data.episodes.episode import Episode
 from forbes.evaluation.estimates import Estimate
 from forbes.models import Filtered
 from forbes.pomdps import Process
-from forbes.seeding import derive_seed, generator
+from forbes.rounding import ceil_div
+from forbes.seeding import derive_seed, forked, generator
 from forbes.training.acting import WorldModelAgent
 
 __all__ = ["DRAWS", "exact_variance", "filter_episode", "learned_variance", "non_gaussianity", "prior_and_posterior"]
@@ -62,8 +63,7 @@ def filter_episode(
     device = next(agent.parameters()).device
     observation = torch.from_numpy(episode.observation.copy()).to(device)[None]  # (1, T + 1, *O)
     action = torch.from_numpy(episode.action.copy()).to(device)  # (T + 1, A)
-    with torch.no_grad(), torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(seed)
+    with torch.no_grad(), forked(device, seed):
         embedding = agent.model.embed(observation).expand(samples, -1, -1)  # (S, T + 1, E)
         yield agent.model.filter(embedding, action.expand(samples, -1, -1)), action
 
@@ -108,7 +108,7 @@ def prior_and_posterior(agent: WorldModelAgent, episode: Episode, seed: int) -> 
     if any(isinstance(head, CategoricalBelief) for head in heads):
         return None
     with filter_episode(agent, episode, 1, derive_seed(seed, "gaussianity", 0)) as (filtered, _):
-        every = -(-filtered.hidden.shape[1] // _STEPS)
+        every = ceil_div(filtered.hidden.shape[1], _STEPS)
         contexts = model.prior_context(filtered.hidden[0, ::every]), filtered.context[0, ::every]  # 2 x (T / every, C)
         return torch.stack([non_gaussianity(*each).mean().cpu() for each in zip(heads, contexts, strict=True)])  # (2,)
 

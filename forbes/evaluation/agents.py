@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +19,7 @@ from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.record import require_readable, write_record
 from forbes.evaluation.reward_prediction import SAMPLES, predict_rewards, r2_by_steps_ahead
 from forbes.pomdps import Process
-from forbes.runs.provenance import commit
+from forbes.runs.provenance import origin
 from forbes.seeding import derive_seed
 from forbes.training.acting import WorldModelAgent, play_measured
 from forbes.training.loading import load_run, loaded_agent
@@ -150,13 +149,7 @@ def _known_process(environment: EnvironmentProcess) -> Process | None:
 
 
 def _record(one: PlayedAgent, folder: Path, seed: int, command: str) -> None:
-    measured = {
-        "checkpoint": one.checkpoint,
-        "command": command,
-        "commit": commit(),
-        "seed": seed,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
+    measured = {"checkpoint": one.checkpoint, **origin(command, seed)}
     entry = {
         **Estimate.of(one.returns)._asdict(),
         "interval_95": bootstrap_interval(one.returns),

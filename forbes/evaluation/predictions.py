@@ -147,7 +147,7 @@ def whole_sequences(data: SequenceDataModule, split: Split, index: Tensor) -> Se
     while (batch := data.sequences(split, index, length)).mask[:, -1].any():
         length *= 2
     last = max(data.length, int(batch.mask.sum(1).max()))
-    return SequenceBatch(*(values[:, :last] for values in batch))  # (B, last, ...)
+    return batch.first(last)  # (B, last, ...)
 
 
 def first_of_each_class(data: SequenceDataModule, split: Split, count: int) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 from forbes.data import SequenceDataModule, Split, Strokes
 from forbes.evaluation.ngram import fit_ngrams
 from forbes.models import Likelihood, Normal
+from forbes.seeding import forked
 
 __all__ = ["lowest_above", "reference_means", "references"]
 
@@ -29,8 +30,7 @@ def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, c
         ngrams = fit_ngrams(data.source, data.length)
         return {f"{order}-gram": values for order, values in ngrams.log_prob(split, count).items()}
     if isinstance(likelihood, Normal):
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # for the dequantisation noise of coarse pixels
+        with forked("cpu", 0):  # for the dequantisation noise of coarse pixels
             return _still_pictures(data, likelihood, split, count)
     return {}
 

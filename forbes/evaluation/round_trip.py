@@ -14,7 +14,7 @@ from torch import Tensor
 from forbes.beliefs import FlowBelief
 from forbes.data import SequenceBatch
 from forbes.models import BeliefModel, StateSpaceModel
-from forbes.seeding import derive_seed
+from forbes.seeding import derive_seed, forked
 
 __all__ = ["LIMIT", "model_round_trip", "print_round_trip", "round_trip"]
 
@@ -56,12 +56,11 @@ def model_round_trip(model: BeliefModel, batch: SequenceBatch, seed: int) -> dic
     if not heads or not isinstance(model, StateSpaceModel):
         return {}
     device = next(model.parameters()).device
-    observation, action, mask = (values.to(device) for values in (batch.observation, batch.action, batch.mask))
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(derive_seed(seed, "round trip", 0))
-        filtered = model.filter(model.embed(observation), action)
+    batch = batch.to(device)
+    with forked(device, derive_seed(seed, "round trip", 0)):
+        filtered = model.filter(model.embed(batch.observation), batch.action)
         contexts = {"prior": model.prior_context(filtered.hidden), "posterior": filtered.context}  # (B, T, C)
-        return {name: round_trip(getattr(model, name), contexts[name][mask]) for name in heads}
+        return {name: round_trip(getattr(model, name), contexts[name][batch.mask]) for name in heads}
 
 
 def print_round_trip(run: str, found: dict[str, dict[str, float]]) -> None:

@@ -27,7 +27,7 @@ from forbes.files import replace_file
 from forbes.models import BeliefModel, StateSpaceModel
 from forbes.pomdps import Process
 from forbes.reading import read_npz
-from forbes.seeding import derive_seed
+from forbes.seeding import derive_seed, forked
 
 __all__ = [
     "PartialScores",
@@ -237,26 +237,25 @@ def score_split(
     """
     device = next(model.parameters()).device
     found: list[Scores] = []
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        for first, batch in batches:
-            values = parts.read(first) if parts else None
-            if values is None:
-                values = _score(model, first, SequenceBatch(*(v.to(device) for v in batch)), score, seed, where)
-                require_finite(where, first, values)
-                if parts:
-                    parts.write(first, values)
-            counts = batch.mask.clone()  # (B, T)
-            counts[:, : score.context] = False
-            found.append(Scores(values, counts))
+    for first, batch in batches:
+        values = parts.read(first) if parts else None
+        if values is None:
+            values = _score(model, first, batch.to(device), score, seed, where)
+            require_finite(where, first, values)
+            if parts:
+                parts.write(first, values)
+        scored = batch.mask.clone()  # (B, T)
+        scored[:, : score.context] = False
+        found.append(Scores(values, scored))
     merged = {name: torch.cat([scores.values[name] for scores in found]) for name in score.metrics}  # (N, T)
     return Scores(merged, torch.cat([scores.mask for scores in found]))
 
 
 def _score(model: BeliefModel, first: int, batch: SequenceBatch, score: Scorer, seed: int, where: str) -> Increments:
     """Score a batch; if it does not fit into memory, score its halves."""
-    torch.manual_seed(derive_seed(seed, "evaluation", first))
     try:
-        scores = score.function(model, batch)
+        with forked(batch.mask.device, derive_seed(seed, "evaluation", first)):
+            scores = score.function(model, batch)
         return {name: scores[name].cpu() for name in score.metrics}  # (B, T)
     except RuntimeError as error:
         if not _out_of_memory(error):
@@ -265,11 +264,11 @@ def _score(model: BeliefModel, first: int, batch: SequenceBatch, score: Scorer, 
     if half == 0:
         raise ForbesError(f"{where}: no memory for one sequence with {score.tag}. Choose fewer particles or samples")
     print(f"{where}: no memory for {len(batch.mask)} sequences at once, trying {half}", file=sys.stderr, flush=True)
-    parts = [
-        _score(model, first + skip, SequenceBatch(*(values[skip:][:count] for values in batch)), score, seed, where)
-        for skip, count in ((0, half), (half, len(batch.mask) - half))
-    ]
-    return {name: torch.cat([part[name] for part in parts]) for name in score.metrics}
+    halves = (
+        _score(model, first, batch.rows(slice(half)), score, seed, where),
+        _score(model, first + half, batch.rows(slice(half, None)), score, seed, where),
+    )
+    return {name: torch.cat([scores[name] for scores in halves]) for name in score.metrics}
 
 
 def _out_of_memory(error: RuntimeError) -> bool:

@@ -19,7 +19,7 @@ from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Bars, Panel, draw_bands
 from forbes.figures.style import BLACK, GREY, PAGE, PALETTE, paper_style
 from forbes.models import BeliefModel
-from forbes.seeding import derive_seed
+from forbes.seeding import derive_seed, forked
 
 __all__ = ["by_ambiguity", "draw_class_scores", "draw_completions", "draw_errors"]
 
@@ -79,8 +79,7 @@ def draw_completions(
     ]
     of_models: list[list[Panel | Bars]] = []
     for row, model, colour in zip(study.runs, models, cycle(PALETTE), strict=False):
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(derive_seed(seed, "drawings", context))
+        with forked("cpu", derive_seed(seed, "drawings", context)):
             completions = complete(model, source, batch, context, _SHOWN)
         frames = completions.frames[:, digit, end - context - 1]  # (S, R, 1, H, W)
         notes = [f"JS = {value:.2f}" for value in row.scores["js[end]"][place].tolist()]

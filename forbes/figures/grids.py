@@ -13,8 +13,9 @@ from torch import Tensor
 from forbes.errors import ForbesError
 from forbes.figures.episodes import MAX_CHANNELS, to_rgb
 from forbes.figures.style import BLACK, GREY, PAGE, paper_style
+from forbes.rounding import ceil_div
 
-__all__ = ["Bars", "Panel", "draw_bands", "draw_panels", "require_images", "seen_panel", "truth_panel"]
+__all__ = ["Bars", "Panel", "draw_bands", "draw_panels", "require_images", "seen_panel", "seen_steps", "truth_panel"]
 
 _GAP = 2  # pixels between the frames of a panel
 _GAP_COLOUR = 0.86
@@ -56,8 +57,13 @@ def truth_panel(observation: Tensor, times: Sequence[int]) -> Panel:
 
 def seen_panel(observation: Tensor, context: int) -> Panel:
     """Return a panel of three of the frames that a model sees."""
-    times = sorted({-(-context * part // 3) for part in (1, 2, 3)})
+    times = seen_steps(context)
     return Panel("seen", _frames(observation, times), GREY, [f"t={time}" for time in times])
+
+
+def seen_steps(context: int) -> list[int]:
+    """Return up to three steps of the context, counted from 1, evenly spaced to its last."""
+    return sorted({ceil_div(context * part, 3) for part in (1, 2, 3)})
 
 
 def require_images(where: str, shape: Sequence[int], remedy: str) -> None:

@@ -6,7 +6,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.figures.grids import Panel, draw_bands
+from forbes.figures.grids import Panel, draw_bands, seen_steps
 from forbes.figures.style import BLACK, BLUE, GREY
 
 __all__ = ["draw_futures", "draw_open_loop"]
@@ -53,7 +53,7 @@ def draw_futures(truth: Tensor, futures: Tensor, context: int, columns: int) -> 
         context: number of frames that the model sees.
         columns: number of frames shown per future, evenly spaced to the last.
     """
-    seen = sorted({-(-context * part // 3) for part in (1, 2, 3)})
+    seen = seen_steps(context)
     later = _later(context, len(truth), columns)
     past = truth[None, [time - 1 for time in seen]]  # (1, S, C, H, W)
     true_rest = truth[None, [time - 1 for time in later]]  # (1, K, C, H, W)

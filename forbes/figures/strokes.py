@@ -14,6 +14,7 @@ from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import COLUMN, draw_range, draw_references, paper_style, show_settled
 from forbes.models import BeliefModel
+from forbes.seeding import forked
 
 __all__ = ["FamilyCurves", "ambiguous_digits", "elbo_against_updates", "predictions"]
 
@@ -56,12 +57,11 @@ def predictions(
     last = batch.observation.shape[1]
     pictures = source.pictures(batch.observation)
     panels = [truth_panel(pictures, sorted({time, last})[::-1]), seen_panel(pictures, context)]
-    with torch.random.fork_rng(devices=[]):
-        for family in families:
-            torch.manual_seed(seed)
+    for family in families:
+        with forked("cpu", seed):
             completions = complete(family.model, source, batch, context, samples, mean)
-            frames = completions.at(time)  # (N, B, C, H, W)
-            panels.append(Panel(f"{family.name}, t = {time}", frames.transpose(0, 1), family.colour))
+        frames = completions.at(time)  # (N, B, C, H, W)
+        panels.append(Panel(f"{family.name}, t = {time}", frames.transpose(0, 1), family.colour))
     return draw_panels(panels)
 
 

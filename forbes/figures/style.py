@@ -16,7 +16,7 @@ from forbes.errors import ForbesError
 from forbes.files import replace_file
 
 __all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "density_map", "draw_range"]
-__all__ += ["draw_references", "paper_style", "save_figure", "show_settled"]
+__all__ += ["draw_references", "paper_style", "save_figure", "save_png_and_pdf", "show_settled"]
 
 COLUMN, PAGE = 3.3, 6.9
 """Widths in inches: one column and the whole page."""
@@ -72,6 +72,14 @@ def save_figure(figure: Figure, path: Path) -> None:
     except ValueError as error:
         raise ForbesError(f"{path}: is not the name of an image ({error}). End it in .png") from error
     replace_file(path, content.getvalue())
+
+
+def save_png_and_pdf(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure as `NAME.png` and `NAME.pdf` to a folder, and return both paths."""
+    paths = [folder / f"{name}{suffix}" for suffix in (".png", ".pdf")]
+    for path in paths:
+        save_figure(figure, path)
+    return paths
 
 
 def density_map(colour: str) -> LinearSegmentedColormap:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from forbes.figures.episodes import to_rgb
+from forbes.rounding import ceil_div
 
 __all__ = ["gif"]
 
@@ -36,7 +37,7 @@ def gif(episodes: Sequence[NDArray[np.uint8]]) -> bytes:
 
 def _pictures(episode: NDArray[np.uint8]) -> Iterator[Image.Image]:
     height, width = episode.shape[2:]
-    factor = -(-_SIDE // max(height, width))
+    factor = ceil_div(_SIDE, max(height, width))
     for frame in episode:
         colours = to_rgb(frame).transpose(1, 2, 0)  # (H, W, 3)
         picture = Image.fromarray(np.ascontiguousarray(colours)).quantize(256)

@@ -20,6 +20,7 @@ from lightning.pytorch.cli import LightningArgumentParser, SaveConfigCallback
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 import forbes
+from forbes.data.datamodule import datamodule_of
 from forbes.errors import ForbesError
 from forbes.files import replace_file
 from forbes.reading import read_json
@@ -27,7 +28,7 @@ from forbes.runs.configuration import allowed_modules
 from forbes.runs.folder import RunFolder
 from forbes.runs.stop import StopOnSignal
 
-__all__ = ["RecordRun", "command_line", "commit", "read_provenance"]
+__all__ = ["RecordRun", "command_line", "commit", "origin", "read_provenance"]
 
 PACKAGES = ("torch", "lightning", "jsonargparse", "numpy", "dm-control", "mujoco", "gymnasium")
 """Packages that may change the results of a run; the last three are optional."""
@@ -128,12 +129,18 @@ def _versions() -> dict[str, str]:
 
 def _describe_data(trainer: Trainer) -> dict[str, Any]:
     """Return the hash of the data."""
-    return {"data_sha256": trainer.datamodule.source.sha256()}  # type: ignore[attr-defined]
+    return {"data_sha256": datamodule_of(trainer).source.sha256()}
 
 
 def command_line(*arguments: str) -> str:
     """Return the command line to repeat a command, with the `--allow-module` flags of this process."""
     return shlex.join(["forbes", *allowed_modules(), *arguments])
+
+
+def origin(command: str, seed: int) -> dict[str, Any]:
+    """Return command, commit, random seed and date, for the record of a result."""
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"command": command, "commit": commit(), "seed": seed, "date": date}
 
 
 def commit() -> str | None:

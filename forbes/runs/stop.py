@@ -9,6 +9,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from forbes.data import Experience
+from forbes.data.datamodule import datamodule_of
 from forbes.runs.folder import RunFolder
 
 __all__ = ["StopOnSignal"]
@@ -41,7 +42,7 @@ class StopOnSignal(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Replace Lightning's signal handlers, which Lightning restores after the training."""
         self._end_loop = signal.getsignal(signal.SIGTERM)
-        self._whole_epochs = isinstance(trainer.datamodule.source, Experience)  # type: ignore[attr-defined]
+        self._whole_epochs = isinstance(datamodule_of(trainer).source, Experience)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._receive)
         if trainer.received_sigterm:  # before this point; Lightning would end the loop within an agent's epoch

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 from small_models import make_model
 
 from forbes.commands import tables
@@ -377,7 +378,7 @@ def test_every_score_stands_beside_its_references(runs, capsys):
 @pytest.mark.parametrize("number", [1, 2, 6])
 @pytest.mark.parametrize("width", [80, 120, 200])
 def test_the_tables_fit_the_terminal_and_cut_no_name(runs, capsys, monkeypatch, number, width):
-    monkeypatch.setattr(tables, "_PIPE", width)
+    monkeypatch.setattr(tables, "console", lambda _: Console(width=width))
     measured = evaluated(runs, number, "elbo")
     name = "test[:1000]/open_loop_marginal[normal(0.5,scale=1),K=1000,c=15]"
     for one in measured:

@@ -17,7 +17,7 @@ from forbes.data.source import Split
 from forbes.data.strokes.classifiers import CLASSES, DigitClassifier, calibration_error
 from forbes.data.strokes.file import SIDE
 from forbes.data.strokes.source import Strokes
-from forbes.seeding import derive_seed, generator
+from forbes.seeding import derive_seed, forked, generator
 
 __all__ = ["Digits", "Quality", "calibrate", "classify", "digits_of", "draw_finished", "draw_prefix", "quality"]
 __all__ += ["fit_classifier", "train_classifiers"]
@@ -97,8 +97,7 @@ def fit_classifier(
         seed: random seed for weights and samples.
     """
     size = len(digits.labels)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive_seed(seed, "digit classifier", 0))
+    with forked("cpu", derive_seed(seed, "digit classifier", 0)):
         classifier = DigitClassifier(draw(digits.take(torch.arange(1)))[0].shape[1])
         optimizer = torch.optim.Adam(classifier.parameters(), _RATE)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * (size // _BATCH))

@@ -13,6 +13,7 @@ from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.strokes.dejong import dejong_path, verify_dejong
 from forbes.data.strokes.file import SIDE, StrokeArrays, load_strokes, sha256_of_arrays
 from forbes.errors import ForbesError
+from forbes.rounding import ceil_div
 from forbes.shapes import printed_by_shape
 
 __all__ = ["StrokePoints", "Strokes", "bundled_path"]
@@ -136,7 +137,7 @@ class Strokes(SequenceSource):
     def steps(self, split: Split) -> Tensor:
         """Return the number of steps of each digit of a split, int64 (N,)."""
         points = self._tensors[split][1].diff()  # (N,)
-        return -(-points // self.points_per_step)
+        return ceil_div(points, self.points_per_step)
 
     def gather(self, split: Split, index: Tensor, length: int) -> StrokePoints:
         """Return the paths of digits by index, int64 (B,), cut or padded to `length` steps."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from forbes.evaluation.calibration.ranks import TwoSampleTest, ranks, tarp_ranks, two_sample_test
 from forbes.evaluation.scores import LogMeanExp
 from forbes.models import EncodedSequence, StateSpaceModel
-from forbes.seeding import derive_seed, generator
+from forbes.seeding import derive_seed, forked, generator
 
 __all__ = ["SelfCalibration", "self_calibration"]
 
@@ -46,9 +46,7 @@ def self_calibration(model: StateSpaceModel, action: Tensor, samples: int, seed:
         samples: number of samples per belief, L. Each uses its own trajectory, since the belief is over (h, s).
         seed: random seed for all samples.
     """
-    devices = [action.device] if action.device.type == "cuda" else []
-    with torch.random.fork_rng(devices):
-        torch.manual_seed(derive_seed(seed, "self-calibration", 0))
+    with forked(action.device, derive_seed(seed, "self-calibration", 0)):
         rollout = model.imagine(model.initial(len(action)), action)
         observation = model.likelihood.sample(model.decode(rollout.features))  # (N, t, *O)
         encoded = EncodedSequence(observation, model.embed_target(observation), action)

@@ -146,7 +146,7 @@ def neighbour_scorer(data: SequenceDataModule, context: int, samples: int, class
 def _to_the_end(batch: SequenceBatch) -> SequenceBatch:
     """Cut a batch at the end of its longest digit."""
     longest = int(batch.mask.sum(1).max())
-    return SequenceBatch(*(values[:, :longest] for values in batch))  # (B, longest, ...)
+    return batch.first(longest)  # (B, longest, ...)
 
 
 def _pictures(data: SequenceDataModule, batch: SequenceBatch) -> SequenceBatch:

@@ -1,13 +1,9 @@
 """Compare completions of several runs on the same digits: scores, paired differences, record and tables."""
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 from torch import Tensor
 
 from forbes.data import Split
@@ -24,7 +20,7 @@ from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import TrainedRun
 from forbes.evaluation.scoring import Scorer, score_split, with_progress
 
-__all__ = ["Row", "Study", "entries", "print_study", "study"]
+__all__ = ["Row", "Study", "entries", "study"]
 
 
 class Row(NamedTuple):
@@ -137,62 +133,3 @@ def entries(study: Study, digits: str) -> list[dict[str, Any]]:
 def _entry(estimate: Estimate) -> dict[str, float | None]:
     """Return an estimate for JSON, with None for NaN."""
     return {key: value if math.isfinite(value) else None for key, value in estimate._asdict().items()}
-
-
-def print_study(study: Study, length: int) -> None:
-    """Print a table of class scores and a table of pixel scores."""
-    title = f"{len(study.prefixes.digits)} digits, {study.prefixes.context} steps seen, {study.samples} completions"
-    of_classes = {
-        "js[end]": "JS to the\nreference",
-        "entropy[end]": "entropy",
-        "entropy_gap[end]": "entropy\ngap",
-        "nll[end]": "−log p of\nthe label",
-        "ece[end]": "ECE",
-        "classes[end]": "classes\nabove 5 %",
-        "clear[end]": "clear\ndigits",
-        "kept[60%]": "class kept\nfrom 60 %",
-        "kept[80%]": "class kept\nfrom 80 %",
-    }
-    of_pixels = {
-        f"energy[t<={length}]": f"energy score\nt ≤ {length}",
-        "energy[end]": "energy score\nend",
-        f"crps[t<={length}]": f"CRPS\nt ≤ {length}",
-        "crps[end]": "CRPS\nend",
-        "grey[end]": "grey\nink",
-        "error[end]": "error\nof one",
-        "best[end]": f"error of the\nbest of {study.samples}",
-        "average[end]": f"error of the\naverage of {study.samples}",
-    }
-    console = Console(width=None if sys.stdout.isatty() else 160)  # into a file, rich would fold at 80
-    console.print(
-        _table(
-            study,
-            f"{title}: their classes, nats",
-            of_classes,
-            [*study.runs, study.reference, study.similar, study.truth],
-        )
-    )
-    console.print(_table(study, f"{title}: their pixels", of_pixels, [*study.runs, study.similar, study.truth]))
-
-
-def _table(study: Study, title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> Table:
-    table = Table(title=title)
-    table.add_column("", overflow="fold")
-    for header in columns.values():
-        table.add_column(header, justify="right")
-    for row in rows:
-        values = {score: _cell(Estimate.of(each)) for score, each in row.scores.items()}
-        values["ece[end]"] = f"{row.calibration:.3f}"
-        table.add_row(escape(row.name), *(values.get(score, "") for score in columns))
-    table.add_section()
-    for one, other, scores in study.differences:
-        values = {score: _cell(each, sign="+") for score, each in scores.items()}
-        table.add_row(escape(f"{one.name} − {other.name}"), *(values.get(score, "") for score in columns))
-    return table
-
-
-def _cell(estimate: Estimate, sign: str = "") -> str:
-    """Write a mean above its standard error."""
-    if not math.isfinite(estimate.mean):
-        return "n/a"
-    return f"{estimate.mean:{sign}.3f}\n± {estimate.standard_error:.3f}"

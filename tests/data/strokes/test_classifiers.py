@@ -79,7 +79,7 @@ def test_a_truncated_file_is_refused(share, tmp_path, monkeypatch):
     path.write_bytes(content[: int(share * len(content))])
     monkeypatch.setattr(shipped, "classifiers_path", lambda: path)
 
-    with pytest.raises(ForbesError, match=r"classifiers\.npz: truncated or not an \.npz file .* install forbes"):
+    with pytest.raises(ForbesError, match=r"classifiers\.npz: truncated or not an \.npz file .* reinstall forbes"):
         load_classifiers("bundled")
 
 
