@@ -51,18 +51,18 @@ def main(argv: Sequence[str]) -> None:
     loaded = load_runs([of_config[0] for of_config in folders.values()])
     wanted = wanted_metrics(loaded, args)
     families = [
-        Family(name, folders[name], run.parameters, [metric for metric, has in metrics.items() if not has])
+        Family(name, folders[name], run.parameters, metrics.lacks)
         for name, run, metrics in zip(folders, loaded, wanted, strict=True)
     ]
     missing = [
         run
         for family, metrics in zip(families, wanted, strict=True)
         for run in family.runs.values()
-        if not _is_measured(run, [metric for metric, has in metrics.items() if has], args.seed)
+        if not _is_measured(run, metrics.has, args.seed)
     ]
     if missing:
         evaluate(missing, args, command)
-    comparison = compare(families, [metric for metric in wanted[0] if any(has[metric] for has in wanted)])
+    comparison = compare(families, [name for name in wanted[0].names if any(name in metrics.has for metrics in wanted)])
     _write(comparison, families, args.output, command)
 
 

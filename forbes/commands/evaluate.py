@@ -33,7 +33,7 @@ from forbes.evaluation.runs import (
 from forbes.evaluation.scoring import PartialScores, Scorer, exact_scorer, make_scorer, score_split, with_progress
 from forbes.runs.provenance import command_line, origin
 
-__all__ = ["evaluate", "main", "wanted_metrics"]
+__all__ = ["WantedMetrics", "evaluate", "main", "wanted_metrics"]
 
 
 class _Job(NamedTuple):
@@ -114,47 +114,63 @@ def _add_references(one: EvaluatedRun, jobs: Sequence[_Job], split: Split) -> No
             }
 
 
-def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[dict[str, bool]]:
-    """Return for each run the full names of the metrics of `evaluate`, and whether its model has each of them."""
+class WantedMetrics(NamedTuple):
+    """The metrics of `evaluate` for a run, by full name."""
+
+    names: list[str]
+    """All metrics, in their order."""
+    has: list[str]
+    """Those that the run's model has."""
+
+    @property
+    def lacks(self) -> list[str]:
+        """Metrics that the run's model does not have."""
+        return [name for name in self.names if name not in self.has]
+
+
+def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[WantedMetrics]:
+    """Return the metrics of `evaluate` for each run."""
     jobs = _jobs(args, runs)
-    return [
-        {
-            _metric_name(run, job, metric, args.split): metric in job.score.of(run.model).metrics
-            for job in jobs
-            for metric in job.score.metrics
-        }
-        for run in runs
-    ]
+    return [WantedMetrics(_names(run, jobs, args.split), _names(run, _of(run, jobs), args.split)) for run in runs]
+
+
+def _names(run: TrainedRun, jobs: Sequence[_Job], split: str) -> list[str]:
+    return [_metric_name(run, job, metric, split) for job in jobs for metric in job.score.metrics]
 
 
 def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
-    """Say which passes to make, on how many sequences; refuse runs that cannot be compared there."""
-    numbers = {name: getattr(args, option) for name, option in PASSES.items()}
-    wanted = {
-        name: make_scorer(name, numbers[name], args.batch_size, args.context) for name in PASSES if name in args.scores
-    }
-    if not any(score.of(run.model).metrics for run in runs for score in wanted.values()):
+    """Return the scorers with their sequences; refuse runs that cannot be scored or compared."""
+    numbers = {name: getattr(args, option) for name, option in PASSES.items() if name in args.scores}
+    scorers = {name: make_scorer(name, number, args.batch_size, args.context) for name, number in numbers.items()}
+    _require_scores(runs, scorers, numbers)
+    if isinstance(source := runs[0].data.source, Simulated):
+        scorers = {"exact": exact_scorer(source.process)} | scorers
+    counts = {name: _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else SUBSET) for name in scorers}
+    hashes = {count: _require_same_data(runs, args, count) for count in dict.fromkeys(counts.values())}
+    if "open-loop" in counts:
+        _require_longer(runs[0], args, counts["open-loop"])
+    return [_Job(name, scorer, counts[name], hashes[counts[name]]) for name, scorer in scorers.items()]
+
+
+def _require_scores(runs: Sequence[TrainedRun], scorers: Mapping[str, Scorer], numbers: Mapping[str, int]) -> None:
+    """Refuse scores that no model has, and numbers of particles or futures that a model cannot use."""
+    if not any(scorer.of(run.model).metrics for run in runs for scorer in scorers.values()):
         raise ForbesError(
-            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(wanted)} score, its likelihood is exact. "
+            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(scorers)} score, its likelihood is exact. "
             "Ask for --scores pll or open-loop"
         )
-    for run, name in itertools.product(runs, [name for name in ("pll", "open-loop") if name in wanted]):
-        run.model.num_belief_samples(numbers[name])  # a number that cannot be is said before minutes are spent
-    if isinstance(source := runs[0].data.source, Simulated):
-        wanted = {"exact": exact_scorer(source.process)} | wanted
-    hashes: dict[int, list[str]] = {}
-    jobs = []
-    for name, score in wanted.items():
-        count = _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else SUBSET)
-        if count not in hashes:
-            for run in runs:
-                _count(run, args, count)
-            hashes[count] = [data_sha256(run.data, args.split, count) for run in runs]
-            require_comparable(runs, hashes[count])
-        jobs.append(_Job(name, score, count, hashes[count]))
-        if name == "open-loop":
-            _require_longer(runs[0], args, count)
-    return jobs
+    for run, name in itertools.product(runs, ("pll", "open-loop")):
+        if name in numbers:
+            run.model.num_belief_samples(numbers[name])
+
+
+def _require_same_data(runs: Sequence[TrainedRun], args: Any, count: int) -> list[str]:
+    """Return the hash of the first sequences in each run's data; refuse runs that are not comparable."""
+    for run in runs:
+        _count(run, args, count)
+    hashes = [data_sha256(run.data, args.split, count) for run in runs]
+    require_comparable(runs, hashes)
+    return hashes
 
 
 def _require_longer(run: TrainedRun, args: Any, count: int) -> None:

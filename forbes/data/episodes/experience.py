@@ -103,7 +103,7 @@ class Experience(SequenceSource):
     def open(self, folder: Path) -> None:
         """Open a folder for the episodes, and lock it until `close`."""
         self._writer = EpisodeWriter(folder).__enter__()
-        self._look()
+        self._refresh()
 
     def close(self) -> None:
         """Unlock the folder and close the environment. Episodes and shapes remain accessible."""
@@ -122,8 +122,8 @@ class Experience(SequenceSource):
             policy: name of the policy, for the record.
             seed: random seed for episodes and policies.
         """
-        for record in collect_episodes(self.environment, self._open(), make_policy, policy, until, seed):
-            self._look()
+        for record in collect_episodes(self.environment, self._require_writer(), make_policy, policy, until, seed):
+            self._refresh()
             yield record
 
     def begin(self, make_policy: MakePolicy, seed: int) -> None:
@@ -133,15 +133,15 @@ class Experience(SequenceSource):
             make_policy: function that makes the policy of the episode; must be picklable.
             seed: random seed, as for `collect`.
         """
-        number = self._open().watermark
+        number = self._require_writer().watermark
         self.player.begin(make_policy, number, episode_seed(seed, number))
 
     def finish(self, policy: str, seed: int) -> EpisodeRecord:
         """Wait for the episode started by `begin`, and store it. The arguments are those of `collect`."""
-        writer, episode = self._open(), self.player.finish()
+        writer, episode = self._require_writer(), self.player.finish()
         seed_of_episode = episode_seed(seed, writer.watermark)
         record = writer.append(episode, seed_of_episode, policy, describe_environment(self.environment))
-        self._look()
+        self._refresh()
         return record
 
     def forget(self) -> None:
@@ -149,13 +149,13 @@ class Experience(SequenceSource):
 
         Episodes that the previous checkpoint, without the newest episode, may still sample are kept.
         """
-        writer = self._open()
+        writer = self._require_writer()
         writer.forget(first_held([*writer.records.values()][:-1], self.capacity))
-        self._look()
+        self._refresh()
 
     def growth(self, episodes: int) -> float:
         """Estimate the number of bytes by which the store grows with `episodes` more, from the existing ones."""
-        records = self._open().records.values()
+        records = self._require_writer().records.values()
         steps = sum(record.steps for record in records)
         more = episodes * steps / len(records)
         if self.capacity is not None:
@@ -168,7 +168,7 @@ class Experience(SequenceSource):
         These are the leading episodes with the same policy, seed and number.
         """
         count = 0
-        for record in self._open().records.values():
+        for record in self._require_writer().records.values():
             same = record.policy == policy and record.seed == episode_seed(seed, count) and record.number == count
             if not same or count == most:
                 break
@@ -178,18 +178,18 @@ class Experience(SequenceSource):
     @property
     def newest(self) -> EpisodeRecord:
         """Record of the latest stored episode."""
-        return list(self._open().records.values())[-1]
+        return list(self._require_writer().records.values())[-1]
 
     @property
     def env_steps(self) -> int:
         """Number of simulator frames so far, including action repeat."""
-        writer = self._open()
+        writer = self._require_writer()
         return writer.index.forgotten_frames + sum(record.frames for record in writer.records.values())
 
     @property
     def agent_steps(self) -> int:
         """Number of actions so far."""
-        writer = self._open()
+        writer = self._require_writer()
         return writer.index.forgotten_steps + sum(record.steps for record in writer.records.values())
 
     @property
@@ -200,8 +200,8 @@ class Experience(SequenceSource):
     @watermark.setter
     def watermark(self, value: int | None) -> None:
         if value is not None:
-            self._open().set_aside(value)
-            self._look()
+            self._require_writer().set_aside(value)
+            self._refresh()
 
     def sha256(self) -> str:
         """Hash the stored episodes."""
@@ -213,23 +213,23 @@ class Experience(SequenceSource):
 
     def train_index(self, batch_size: int, length: int, seed: int, update: int) -> Tensor:
         """Sample the segments of one training batch, int64 `(B,)`, as `Replay.train_index` does."""
-        return self._drawn().train_index(batch_size, length, seed, update)
+        return self._require_replay().train_index(batch_size, length, seed, update)
 
     def latest(self, count: int) -> Tensor:
         """Return the first segments of the newest episodes, the newest first, int64 `(count,)` or fewer."""
-        return self._drawn().latest(count)
+        return self._require_replay().latest(count)
 
     def gather(self, split: Split, index: Tensor, length: int) -> Segments:
         """Return segments by index, int64 (B,), read from the mapped files."""
-        return self._drawn().gather(split, index, length)
+        return self._require_replay().gather(split, index, length)
 
     def decode(self, compact: Segments) -> SequenceBatch:
         """Add the state, which is unknown."""
-        return self._drawn().decode(compact)
+        return self._require_replay().decode(compact)
 
-    def _look(self) -> None:
+    def _refresh(self) -> None:
         """Sample from the episodes that are stored now."""
-        writer = self._open()
+        writer = self._require_writer()
         if not writer.records:
             self._replay = None
         elif self._replay is None:
@@ -237,12 +237,12 @@ class Experience(SequenceSource):
         else:
             self._replay.refresh()
 
-    def _open(self) -> EpisodeWriter:
+    def _require_writer(self) -> EpisodeWriter:
         if self._writer is None:
             raise ForbesError(f"Experience: the episodes of {self.task} are not open, expected a running `forbes fit`")
         return self._writer
 
-    def _drawn(self) -> Replay:
+    def _require_replay(self) -> Replay:
         if self._replay is None:
             raise ForbesError(f"Experience: there are no episodes of {self.task} yet. Add the callback Collect")
         return self._replay

@@ -1,17 +1,18 @@
 """Stored episodes as training data: segments of fixed length, memory-mapped."""
 
 import hashlib
+from collections.abc import Iterator
 from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from forbes.data.episodes.episode import Episode, EpisodeRecord
 from forbes.data.episodes.store import EpisodeStore, first_held
-from forbes.data.episodes.episode import EpisodeRecord
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError
+from forbes.rounding import ceil_div
 from forbes.seeding import generator
 from forbes.shapes import printed_by_shape
 
@@ -32,6 +33,27 @@ class Segments(NamedTuple):
     """False on padding, bool (B, T)."""
     ended: Tensor
     """True on the last step of an episode that terminated, bool (B, T)."""
+
+    @classmethod
+    def empty(cls, count: int, length: int, observation_shape: tuple[int, ...], action_dim: int) -> "Segments":
+        """Return `count` segments of padding."""
+        dtype = torch.uint8 if len(observation_shape) == 3 else torch.float32
+        return cls(
+            observation=torch.zeros(count, length, *observation_shape, dtype=dtype),
+            action=torch.zeros(count, length, action_dim),
+            reward=torch.zeros(count, length),
+            mask=torch.zeros(count, length, dtype=torch.bool),
+            ended=torch.zeros(count, length, dtype=torch.bool),
+        )
+
+    def fill(self, row: int, episode: Episode, start: int) -> None:
+        """Copy the steps of an episode from `start` on to segment `row`."""
+        end = min(start + self.mask.shape[1], len(episode.reward))
+        steps, filled = slice(start, end), slice(0, end - start)
+        for name in ("observation", "action", "reward"):
+            getattr(self, name).numpy()[row, filled] = getattr(episode, name)[steps]
+        self.mask[row, filled] = True
+        self.ended[row, end - start - 1] = episode.terminated and end == len(episode.reward)
 
 
 class _Table(NamedTuple):
@@ -124,7 +146,7 @@ class Replay(SequenceSource):
 
     def _table(self, numbers: list[int], stride: int) -> _Table:
         lengths = torch.tensor([self.store.records[number].steps + 1 for number in numbers], dtype=torch.int64)
-        return _Table(numbers, lengths, (-(-lengths // stride)).cumsum(0))  # (E,), (E,)
+        return _Table(numbers, lengths, ceil_div(lengths, stride).cumsum(0))  # (E,), (E,)
 
     def _stride(self, split: Split) -> int:
         return 1 if split == "train" else self.stride
@@ -162,24 +184,18 @@ class Replay(SequenceSource):
         """Return segments by index, int64 (B,), read from the mapped files."""
         if length < 1:
             raise ForbesError(f"Replay: length is {length}, expected at least 1 step.")
-        table, count, stride = self._require(split), len(index), self._stride(split)
+        segments = Segments.empty(len(index), length, self.observation_shape, self.action_dim)
+        for row, (number, start) in enumerate(self._locate(split, index)):
+            segments.fill(row, self.store.episode(number), start)
+        return segments
+
+    def _locate(self, split: Split, index: Tensor) -> Iterator[tuple[int, int]]:
+        """Yield the number of the episode and the start of each segment."""
+        table, stride = self._require(split), self._stride(split)
         row = torch.searchsorted(table.ends, index, right=True)  # (B,)
-        windows = -(-table.lengths // stride)  # (E,)
-        start = stride * (index - (table.ends - windows)[row])  # (B,)
-        dtype = np.uint8 if len(self.observation_shape) == 3 else np.float32
-        observation = np.zeros((count, length, *self.observation_shape), dtype)
-        action = np.zeros((count, length, self.action_dim), np.float32)
-        reward, mask = np.zeros((count, length), np.float32), np.zeros((count, length), bool)
-        ended = np.zeros((count, length), bool)
-        for window, (place, begin) in enumerate(zip(row.tolist(), start.tolist(), strict=True)):
-            episode = self.store.episode(table.numbers[place])
-            end = min(begin + length, len(episode.reward))
-            steps, there = slice(begin, end), slice(0, end - begin)
-            observation[window, there] = episode.observation[steps]
-            action[window, there], reward[window, there] = episode.action[steps], episode.reward[steps]
-            mask[window, there] = True
-            ended[window, end - begin - 1] = episode.terminated and end == len(episode.reward)
-        return Segments(*map(torch.from_numpy, (observation, action, reward, mask, ended)))
+        before = table.ends - ceil_div(table.lengths, stride)  # (E,), segments of earlier episodes
+        start = stride * (index - before[row])  # (B,)
+        return zip((table.numbers[episode] for episode in row.tolist()), start.tolist(), strict=True)
 
     def decode(self, compact: Segments) -> SequenceBatch:
         """Add the state, which is unknown."""
