@@ -7,9 +7,10 @@ import itertools
 import pydoc
 import re
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
@@ -28,6 +29,16 @@ SECTIONS = {"data.source": SequenceSource, "data": SequenceDataModule, "trainer"
 CONFIGURABLE = (nn.Module, LightningDataModule, SequenceSource, Callback, Logger)
 
 
+class _Complaint(NamedTuple):
+    """What is wrong with a configuration."""
+
+    key: str
+    """Key of the configuration, or empty."""
+    sentence: str
+    file: str = ""
+    """File that the sentence is about, if it is not about a key."""
+
+
 def one_sentence(message: str, arguments: Sequence[str] = ()) -> str:
     """Return one sentence that says where a configuration is wrong, and what to write instead.
 
@@ -35,48 +46,76 @@ def one_sentence(message: str, arguments: Sequence[str] = ()) -> str:
         message: message of jsonargparse, with many lines about nested types.
         arguments: command line, to distinguish a wrong flag from a wrong line in a file.
     """
-    keys = re.findall(r'Parser key "([\w.]+)"', message)
-    if found := re.search(r"unrecognized arguments: (\S+\.ya?ml)\b", message):
-        return f"{found[1]}: a configuration needs its flag. Write: --config {found[1]}"
-    if found := re.search(r"[Oo]ption '([\w.]+)'|unrecognized arguments: --([\w.]+)", message):
-        key, sentence = _unknown_option(message, keys, found[1] or found[2])
-    elif found := re.search(r"Expected a dot import path string: (\S*)|has no attribute '(\w+)'", message):
-        key, sentence = ".".join(keys), _unknown_class(found[1] or found[2] or "''")
-    elif found := re.search(r"Importing '([\w.]+)' is not allowed", message):
-        module = found[1].rpartition(".")[0]
-        key = ".".join(keys)
-        sentence = f"{found[1]} is not a class of forbes or Lightning. If you trust it, add: --allow-module {module}"
-    elif found := re.search(r"arguments are required: ([\w., ]+)", message):
-        key, sentence = ".".join(keys), f"{found[1]} missing, {_supply('.'.join(keys), found[1])}"
-    elif found := re.search(r"File does not exist: '(.*)'", message):
-        return f"{found[1]}: no such file. The configurations of forbes are in configs/"
-    else:
-        key, sentence = ".".join(keys), _wrong_value(message)
+    key, sentence, file = _complaint(message, re.findall(r'Parser key "([\w.]+)"', message))
+    if file:
+        return f"{file}: {sentence}"
     return f"{_place(key, arguments)}{key + ': ' if key else ''}{shortened(sentence, _LENGTH)}"
 
 
-def _supply(key: str, missing: str) -> str:
-    """Return how to supply a missing argument of a class, or the whole configuration."""
-    if not key:
-        return "give a configuration: --config configs/strokes/forbes.yaml"
-    return f"give it: --{key}.{missing} VALUE"
+def _complaint(message: str, keys: list[str]) -> _Complaint:
+    """Explain a message by the first rule that matches, or as a wrong value."""
+    for pattern, explain in _RULES:
+        if match := re.search(pattern, message):
+            return explain(match, message, keys)
+    return _Complaint(".".join(keys), _wrong_value(message))
 
 
-def _unknown_option(message: str, keys: list[str], option: str) -> tuple[str, str]:
-    """Return key and sentence for an option that a class, the trainer or the configuration does not have."""
+def _missing_flag(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    return _Complaint("", f"a configuration needs its flag. Write: --config {match[1]}", match[1])
+
+
+def _missing_file(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    return _Complaint("", "no such file. The configurations of forbes are in configs/", match[1])
+
+
+def _missing_argument(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    """Explain a missing argument of a class, or a missing configuration."""
+    key = ".".join(keys)
+    remedy = f"give it: --{key}.{match[1]} VALUE" if key else "give a configuration: --config configs/strokes/forbes.yaml"
+    return _Complaint(key, f"{match[1]} missing, {remedy}")
+
+
+def _unknown_option(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    """Explain an option that a class, the trainer or the configuration does not have."""
+    option = match[1] or match[2]
     if group := re.search(r"Group '(\w+)'", message):
         keys = [group[1], *keys]
     path = [*keys, *option.removesuffix(".class_path").split(".")]
     owners = re.findall(r"class_path[= ]'([\w.]+)'", message)
     if owners and pydoc.locate(owners[-1]) is None:  # a short name, with arguments that are not in init_args
-        return ".".join(keys), f"{owners[-1]}: expected init_args next to class_path, found {option.split('.')[0]}"
+        sentence = f"{owners[-1]}: expected init_args next to class_path, found {option.split('.')[0]}"
+        return _Complaint(".".join(keys), sentence)
     if owners:
         owner, valid = owners[-1].rpartition(".")[2], list(inspect.signature(pydoc.locate(owners[-1])).parameters)  # type: ignore[arg-type]
     elif path[0] == "trainer":
         owner, valid = "Trainer", list(inspect.signature(Trainer).parameters)
     else:
-        return path[0], f"the configuration has no such option{_nearest_of_all(path[0])}"
-    return ".".join(path), f"{owner} has no such option{_nearest(path[-1], valid)}"
+        return _Complaint(path[0], f"the configuration has no such option{_nearest_of_all(path[0])}")
+    return _Complaint(".".join(path), f"{owner} has no such option{_nearest(path[-1], valid)}")
+
+
+def _unknown_class(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    """Explain a class that does not exist, or has the wrong type."""
+    name = match[1] or match[2] or "''"
+    nearest = _nearest(name, sorted(_class_names() - {name}))
+    return _Complaint(".".join(keys), f"no class {name} that fits here{nearest}")
+
+
+def _untrusted_class(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    module = match[1].rpartition(".")[0]
+    sentence = f"{match[1]} is not a class of forbes or Lightning. If you trust it, add: --allow-module {module}"
+    return _Complaint(".".join(keys), sentence)
+
+
+_RULES: tuple[tuple[str, Callable[[re.Match[str], str, list[str]], _Complaint]], ...] = (
+    (r"unrecognized arguments: (\S+\.ya?ml)\b", _missing_flag),
+    (r"[Oo]ption '([\w.]+)'|unrecognized arguments: --([\w.]+)", _unknown_option),
+    (r"Expected a dot import path string: (\S*)|has no attribute '(\w+)'", _unknown_class),
+    (r"Importing '([\w.]+)' is not allowed", _untrusted_class),
+    (r"arguments are required: ([\w., ]+)", _missing_argument),
+    (r"File does not exist: '(.*)'", _missing_file),
+)
+"""Patterns in the messages of jsonargparse 4.53, and the functions that explain them."""
 
 
 def _nearest_of_all(option: str) -> str:
@@ -91,11 +130,6 @@ def _arguments(kind: type) -> set[str]:
     """Return the arguments of a class and of its subclasses in forbes."""
     ours = [derived for derived in _derived([kind]) if derived is kind or derived.__module__.startswith("forbes.")]
     return {name for derived in ours for name in inspect.signature(derived).parameters}
-
-
-def _unknown_class(name: str) -> str:
-    """Return the sentence for a class that does not exist, or has the wrong type."""
-    return f"no class {name} that fits here{_nearest(name, sorted(_class_names() - {name}))}"
 
 
 def _class_names() -> set[str]:
