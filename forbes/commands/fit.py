@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jsonargparse import DefaultHelpFormatter
@@ -113,6 +113,33 @@ def _run(command: str, arguments: Sequence[str]) -> int:
             raise
 
 
+class _FitOptions(NamedTuple):
+    """Options of `fit` that are not part of the configuration."""
+
+    experiment: str | None = None
+    """Name of the experiment."""
+    run_dir: str | None = None
+    """Path of the run folder."""
+    resumed: RunFolder | None = None
+    """Run folder to resume."""
+    on_divergence: str = "stop"
+    """What to do after a divergence: stop or lower-rate."""
+
+    @classmethod
+    def parse(cls, arguments: Sequence[str]) -> tuple["_FitOptions", list[str]]:
+        """Return the options, and the arguments of the configuration, after those of a resumed run."""
+        options, rest = run_options().parse_known_args(arguments)
+        for option in ("resume", "run_dir"):
+            if (folder := getattr(options, option)) and folder.endswith(".ckpt"):
+                raise ForbesError(f"--{option} {folder}: is a checkpoint, expected a run folder")
+        if not options.resume:
+            return cls(options.experiment, options.run_dir, None, options.on_divergence), rest
+        run = RunFolder.trained(options.resume)
+        older = changed_defaults(read_config(run.config))
+        flags = [part for key, value in older.items() for part in (f"--{key}", str(value))]
+        return cls(resumed=run, on_divergence=options.on_divergence), ["--config", str(run.config), *flags, *rest]
+
+
 class _Help(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter):
     """Help formatter that keeps the line breaks of the run folder's options."""
 
@@ -128,18 +155,10 @@ class _Experiment(LightningCLI):
 
     def __init__(self, command: str, arguments: Sequence[str], stack: ExitStack) -> None:
         self.command, self.arguments, self.stack = command, arguments, stack
-        options = run_options()
-        self.options, rest = options.parse_known_args(arguments if command == "fit" else [])
-        for option in ("resume", "run_dir"):
-            if (folder := getattr(self.options, option)) and folder.endswith(".ckpt"):
-                raise ForbesError(f"--{option} {folder}: is a checkpoint, expected a run folder")
-        self.resumed = RunFolder.trained(self.options.resume) if self.options.resume else None
-        if command != "fit":
-            rest = list(arguments)
-        elif self.resumed:
-            older = changed_defaults(read_config(self.resumed.config))
-            flags = [part for key, value in older.items() for part in (f"--{key}", str(value))]
-            rest = ["--config", str(self.resumed.config), *flags, *rest]
+        self.stop: StopOnSignal | None = None
+        self.options, configuration = _FitOptions(), list(arguments)
+        if command == "fit":
+            self.options, configuration = _FitOptions.parse(arguments)
         super().__init__(
             model_class=LightningModule,
             datamodule_class=SequenceDataModule,
@@ -150,13 +169,13 @@ class _Experiment(LightningCLI):
                 "usage": f"forbes {self.command} --config FILE [--OPTION VALUE ...]",
                 "formatter_class": _Help,
                 "description": DESCRIPTION[self.command],
-                "epilog": options.format_help() if self.command == "fit" else None,
+                "epilog": run_options().format_help() if self.command == "fit" else None,
                 "exit_on_error": False,
                 "allow_abbrev": False,
             },
             subclass_mode_model=True,
             subclass_mode_data=True,
-            args=rest,
+            args=configuration,
             run=False,
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,
@@ -204,7 +223,6 @@ class _Experiment(LightningCLI):
             callbacks.append(progress())
         if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
             plugins.append(AtomicCheckpointIO())
-        self.stop: StopOnSignal | None = None
         if self.command != "fit" or config["fast_dev_run"]:
             self.save_config_callback = None
             given = {"logger": False, "enable_checkpointing": False}
@@ -230,15 +248,15 @@ class _Experiment(LightningCLI):
     def _open_run(self) -> RunFolder:
         """Create the run folder, or use the one that was named, and lock it."""
         options = self.options
-        if self.resumed:
-            run = self.resumed
+        if options.resumed:
+            run = options.resumed
         elif options.run_dir:
             run = RunFolder(options.run_dir)
         else:
             experiment = options.experiment or experiment_name([str(path) for path in self.config["config"] or []])
             run = RunFolder.new(experiment, time.strftime("%Y%m%d-%H%M%S"), self.config["seed_everything"])
         self.stack.enter_context(run.locked())
-        if not self.resumed and run.checkpoint.exists():
+        if not options.resumed and run.checkpoint.exists():
             raise ForbesError(f"{run}: holds a trained run. Name another, or resume it: forbes fit --resume {run}")
         if run.provenance.is_file():
             read_provenance(run.provenance)  # reports a damaged file before the training begins
@@ -246,7 +264,7 @@ class _Experiment(LightningCLI):
 
     def execute(self) -> int:
         """Run the command and return its exit status."""
-        checkpoint = self.resumed.checkpoint if self.resumed else self.config.get("ckpt_path")
+        checkpoint = self.options.resumed.checkpoint if self.options.resumed else self.config.get("ckpt_path")
         updates = 0
         if checkpoint:
             content = read_checkpoint(Path(checkpoint))

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from forbes.data.strokes.file import SIDE, StrokeArrays
 from forbes.errors import ForbesError
 
-__all__ = ["Comparison", "compare_digits", "compare_sets"]
+__all__ = ["PathSimilarity", "compare_digits", "compare_sets"]
 
 
-class Comparison(NamedTuple):
+class PathSimilarity(NamedTuple):
     """Similarity of two pen paths of one digit."""
 
     iou: float
@@ -22,13 +22,13 @@ class Comparison(NamedTuple):
     """Absolute Spearman correlation of first visits on the common pixels; NaN with fewer than 3 common pixels."""
 
 
-def compare_digits(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Comparison:
+def compare_digits(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> PathSimilarity:
     """Compare two paths, each uint8 (P, 2)."""
     (a, visit_a), (b, visit_b) = (np.unique(_pixel_numbers(path), return_index=True) for path in (one, other))
     common, in_a, in_b = np.intersect1d(a, b, assume_unique=True, return_indices=True)
     gap = np.stack(np.divmod(a, SIDE), -1)[:, None] - np.stack(np.divmod(b, SIDE), -1)  # (A, B, 2)
     distance = np.sqrt((gap**2).sum(-1))  # (A, B)
-    return Comparison(
+    return PathSimilarity(
         iou=len(common) / (len(a) + len(b) - len(common)),
         chamfer=float(distance.min(1).mean() + distance.min(0).mean()) / 2,
         order=_rank_correlation(visit_a[in_a], visit_b[in_b]),
