@@ -84,31 +84,33 @@ def evaluate(
     finished: list[PartialScores] = []
     measured = []
     for number, run in enumerate(runs):
-        one = EvaluatedRun(run, {}, {})
+        evaluated = EvaluatedRun(run, {}, {})
         for job in _of(run, jobs):
-            finished.append(_measure(one, job, job.sha256[number], args, folders[run.path]))
-        _add_references(one, jobs, args.split)
-        for entry in one.entries.values():
+            finished.append(_measure(evaluated, job, job.sha256[number], args, folders[run.path]))
+        _add_references(evaluated, jobs, args.split)
+        for entry in evaluated.entries.values():
             entry.update(origin(command, args.seed), parameters=run.parameters)
-        measured.append(one)
+        measured.append(evaluated)
     for first, second, differences in compare_pairs(measured):
         record_differences(first, second, differences)
-    for one in measured:
-        write_record(folders[one.run.path], one.entries | _round_trip(one.run, args), one.totals)
+    for evaluated in measured:
+        write_record(
+            folders[evaluated.run.path], evaluated.entries | _round_trip(evaluated.run, args), evaluated.totals
+        )
     for parts in finished:
         parts.remove()
     return measured
 
 
-def _add_references(one: EvaluatedRun, jobs: Sequence[_Job], split: Split) -> None:
+def _add_references(evaluated: EvaluatedRun, jobs: Sequence[_Job], split: Split) -> None:
     """Add to each score the scores of the reference models on the same steps of the same sequences."""
     found: dict[int, dict[str, Tensor]] = {}
-    for job in _of(one.run, jobs):
+    for job in _of(evaluated.run, jobs):
         scores = [metric for metric in job.score.metrics if metric in SCORES]
         if scores and job.sequences not in found:
-            found[job.sequences] = references(one.run.data, one.run.model.likelihood, split, job.sequences)
+            found[job.sequences] = references(evaluated.run.data, evaluated.run.model.likelihood, split, job.sequences)
         for metric in scores:
-            one.entries[_metric_name(one.run, job, metric, split)]["references"] = {
+            evaluated.entries[_metric_name(evaluated.run, job, metric, split)]["references"] = {
                 name: Estimate.of(values[:, job.score.context :].sum(1))._asdict()
                 for name, values in found[job.sequences].items()
             }
@@ -228,9 +230,9 @@ def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
     return f"{split}{part}/{metric}[{tag}]"
 
 
-def _measure(one: EvaluatedRun, job: _Job, sha256: str, args: Any, folder: Path) -> PartialScores:
+def _measure(evaluated: EvaluatedRun, job: _Job, sha256: str, args: Any, folder: Path) -> PartialScores:
     """Score a run and add the results to it. Return the saved partial scores, which are to be removed at the end."""
-    run, score = one.run, job.score
+    run, score = evaluated.run, job.score
     parts = PartialScores(
         folder / "evaluation-parts", run.checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed
     )
@@ -240,8 +242,8 @@ def _measure(one: EvaluatedRun, job: _Job, sha256: str, args: Any, folder: Path)
     scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts)
     for metric in score.metrics:
         name = _metric_name(run, job, metric, args.split)
-        one.totals[name] = scores.total(metric)
-        one.entries[name] = describe(scores, metric) | {
+        evaluated.totals[name] = scores.total(metric)
+        evaluated.entries[name] = describe(scores, metric) | {
             "data": {"name": data_name(run.data), "sha256": sha256},
             "checkpoint": run.checkpoint,
             "device": str(next(run.model.parameters()).device),

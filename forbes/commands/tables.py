@@ -20,12 +20,14 @@ __all__ = ["beaten_by", "print_degradation", "print_pairs", "print_references", 
 def print_runs(measured: Sequence[EvaluatedRun]) -> None:
     """Print every metric of every run; n/a if its model does not have it."""
     screen = console(200)
-    for number, one in enumerate(measured, start=1):
-        text = f"{number}  {escape(one.run.path)}: {one.run.family}, {one.run.parameters:,} parameters"
+    for number, evaluated in enumerate(measured, start=1):
+        text = (
+            f"{number}  {escape(evaluated.run.path)}: {evaluated.run.family}, {evaluated.run.parameters:,} parameters"
+        )
         screen.print(text, soft_wrap=True)
     columns = {
-        str(number): {name: _cell(name, entry) for name, entry in one.entries.items()}
-        for number, one in enumerate(measured, start=1)
+        str(number): {name: _cell(name, entry) for name, entry in evaluated.entries.items()}
+        for number, evaluated in enumerate(measured, start=1)
     }
     _print(screen, "nats per sequence, mean ± standard error; ess as a fraction of K", columns)
 
@@ -33,14 +35,16 @@ def print_runs(measured: Sequence[EvaluatedRun]) -> None:
 def print_references(measured: Sequence[EvaluatedRun]) -> None:
     """Print the scores of the references on the same sequences, and explain the marks of `print_runs`."""
     columns: dict[str, dict[str, str]] = {}
-    for name, entry in itertools.chain.from_iterable(one.entries.items() for one in measured):
+    for name, entry in itertools.chain.from_iterable(evaluated.entries.items() for evaluated in measured):
         for reference, estimate in entry.get("references", {}).items():
             columns.setdefault(reference, {})[name] = str(_estimate(estimate))
     if not columns:
         return
     screen = console(200)
     _print(screen, "log p of the same steps under models without a belief, nats per sequence", columns)
-    below = [one.run.path for one in measured if any(beaten_by(entry) for entry in one.entries.values())]
+    below = [
+        evaluated.run.path for evaluated in measured if any(beaten_by(entry) for entry in evaluated.entries.values())
+    ]
     if below:
         text = f"<: below this reference, so the model has learned less than it: {escape(', '.join(below))}"
         screen.print(text, soft_wrap=True)
@@ -66,12 +70,12 @@ def print_pairs(pairs: Sequence[Pair]) -> None:
 def print_degradation(measured: Sequence[EvaluatedRun]) -> None:
     """Print the degradation of every run that has both the closed-loop and the open-loop score."""
     curves: dict[str, dict[str, list[float]]] = {}
-    for one in measured:
-        for name, entry in one.entries.items():
-            curves.setdefault(name, {})[one.run.path] = entry["curve"]
+    for evaluated in measured:
+        for name, entry in evaluated.entries.items():
+            curves.setdefault(name, {})[evaluated.run.path] = entry["curve"]
     for metric, of_runs in degradation(curves).items():
         rows = at_horizons(metric, of_runs)
-        numbers = {one.run.path: str(number) for number, one in enumerate(measured, start=1)}
+        numbers = {evaluated.run.path: str(number) for number, evaluated in enumerate(measured, start=1)}
         columns = {
             numbers[path]: {f"{horizon} steps": f"{loss:.2f}" for horizon, loss in row.items()}
             for path, row in rows.items()

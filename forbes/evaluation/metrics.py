@@ -80,9 +80,11 @@ def compare_pairs(measured: Sequence[EvaluatedRun]) -> list[Pair]:
 def record_differences(first: EvaluatedRun, second: EvaluatedRun, differences: dict[str, Estimate]) -> None:
     """Add the differences of a pair to the entries of both runs."""
     for name, difference in differences.items():
-        for one, other, sign in [(first, second, 1), (second, first, -1)]:
+        for evaluated, other, sign in [(first, second, 1), (second, first, -1)]:
             mine = {"minus": other.run.path, "mean": sign * difference.mean}
-            one.entries[name].setdefault("paired", []).append(mine | {"standard_error": difference.standard_error})
+            evaluated.entries[name].setdefault("paired", []).append(
+                mine | {"standard_error": difference.standard_error}
+            )
 
 
 def degradation(curves: Curves) -> dict[str, dict[str, list[float]]]:
