@@ -1,7 +1,7 @@
-"""FORBES: learn, measure and use belief states of partially observable processes.
+"""FORBES: learn, evaluate and use belief states of partially observable processes.
 
-Every public name is imported when it is first used (PEP 562), so that `import forbes` and `forbes --help` need no
-torch. `__init__.pyi` tells the same names to type checkers.
+Public names are imported on first use (PEP 562), so that `import forbes` and `forbes --help` do not import torch.
+`__init__.pyi` declares the same names for type checkers.
 """
 
 import importlib
@@ -22,7 +22,7 @@ _PUBLIC = {
     "training.loading": "load_run",
 }
 MODULES = {name: f"forbes.{part}" for part, names in _PUBLIC.items() for name in names.split()}
-"""Where each public name is imported from."""
+"""Module of each public name."""
 
 __all__ = ["MODULES", "__version__", *MODULES]
 
@@ -36,5 +36,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names, imported or not."""
+    """Return all public names, including those not imported yet."""
     return sorted({*globals(), *MODULES})

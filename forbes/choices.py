@@ -1,16 +1,16 @@
-"""What a user may choose from, for the command line and for Python; nothing here needs torch."""
+"""Choices of arguments, for the command line and for Python. Does not import torch."""
 
 from typing import Literal, TypeAlias
 
 __all__ = ["LONGEST", "PASSES", "SUBSET", "Dataset", "Fetched", "Origin", "Split"]
 
-LONGEST = 1_000_000  # seconds; the system counts milliseconds in 32 bits
+LONGEST = 1_000_000  # maximal timeout in seconds; the system counts milliseconds in 32 bits
 
 Split: TypeAlias = Literal["train", "validation", "test"]
 Dataset: TypeAlias = Literal["strokes"]
 Fetched: TypeAlias = Literal["strokes", "curves"]
 Origin: TypeAlias = Literal["bundled", "dejong"]
-"""A set of strokes."""
+"""Set of digit strokes."""
 
 PASSES = {
     "elbo": "samples",
@@ -18,6 +18,6 @@ PASSES = {
     "fivo": "particles",
     "open-loop": "futures",
 }
-"""Scores of sequences, with the option that has the number of samples of each."""
+"""Scores of sequences, and the option for the number of samples of each."""
 SUBSET = 1000
-"""Sequences that particles are spent on, unless the user says otherwise."""
+"""Default number of sequences for the expensive scores, which use particles or futures."""

@@ -1,4 +1,4 @@
-"""Classes whose instances are built later, by whoever knows the sizes: `FlowBelief.configured(layers=3)`."""
+"""Classes whose instances are built later, when their sizes are known: `FlowBelief.configured(layers=3)`."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,7 +8,7 @@ __all__ = ["Configurable"]
 
 
 class Configurable:
-    """A class that a model builds itself, from sizes that only the model knows.
+    """A class whose sizes are determined by the model that instantiates it.
 
     Example:
         >>> from forbes import FlowBelief
@@ -23,6 +23,6 @@ class Configurable:
         """Return a function that builds an instance with these options.
 
         Args:
-            **options: arguments of the constructor by name, all but the sizes.
+            **options: constructor arguments by name, except the sizes.
         """
         return partial(cls, **options)

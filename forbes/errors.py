@@ -1,4 +1,4 @@
-"""The error a user can mend: one sentence that says what, where and what to do."""
+"""The error that a user can fix: one sentence that says where, what and what to do."""
 
 import errno
 from pathlib import Path
@@ -7,18 +7,18 @@ from typing import Any
 __all__ = ["FULL", "ForbesError", "require_at_least", "unwritable"]
 
 FULL = {
-    errno.ENOSPC: "Make room, or choose another place",
-    errno.EDQUOT: "Make room in your quota, or choose another place",
-    errno.EFBIG: "Allow larger files (ulimit -f unlimited), or choose another place",
+    errno.ENOSPC: "Free some space, or choose another folder",
+    errno.EDQUOT: "Free some space in your quota, or choose another folder",
+    errno.EFBIG: "Allow larger files (ulimit -f unlimited), or choose another folder",
 }
-"""What to do where the system stores no more, by its number for the error."""
+"""What to do if no more data can be stored, by error number."""
 
 
 class ForbesError(Exception):
-    """Bad input or a bad environment.
+    """Invalid input or an invalid environment.
 
-    The message is one clear sentence: where, what, what was expected, what to do. The command line prints it
-    as ``forbes: <message>`` and exits with `exit_status`; ``--debug`` shows the traceback.
+    The message is one sentence: where, what, what was expected, what to do. The command line prints it as
+    `forbes: <message>` and exits with `exit_status`; `--debug` shows the traceback.
 
     Example:
         >>> forbes.Strokes(points_per_step=0)
@@ -50,6 +50,6 @@ def require_at_least(least: float, where: str, **numbers: Any) -> None:
 
 
 def unwritable(path: Path | str, error: OSError) -> ForbesError:
-    """Return the sentence for a file that cannot be written: which, why and what to do."""
-    remedy = FULL.get(error.errno or 0, "Choose another place")
+    """Return the error for a file that cannot be written."""
+    remedy = FULL.get(error.errno or 0, "Choose another folder")
     return ForbesError(f"{path}: cannot be written ({error.strerror}). {remedy}")

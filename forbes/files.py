@@ -1,7 +1,7 @@
-"""Files that no reader sees half of, folders that no two processes write to, arrays that are stored alike anywhere.
+"""Atomic writes, locked folders, and reproducible archives.
 
-Where a file cannot be written, as on a full disk, one sentence names it. A folder may come from anywhere. What is
-written to it is written there, and not to where a symbolic link in it leads.
+Errors when writing, e.g. on a full disk, are one sentence with the name of the file. Symbolic links are not followed,
+since a folder may come from an untrusted source.
 """
 
 import errno
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from forbes.errors import ForbesError, unwritable
+from forbes.errors import FULL, ForbesError, unwritable
 
 __all__ = ["append_whole", "drop_half_line", "fsync_folder", "locked", "no_link", "npz_bytes", "replace_file"]
 __all__ += ["remove_halves", "require_no_links", "require_room", "writing"]
@@ -29,10 +29,10 @@ __all__ += ["remove_halves", "require_no_links", "require_room", "writing"]
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn what the system says while this file is written into one sentence.
+    """Turn an OSError while this file is written into one sentence.
 
     Raises:
-        ForbesError: for an OSError inside.
+        ForbesError: for an OSError inside the `with` block.
     """
     try:
         yield
@@ -43,17 +43,17 @@ def writing(path: Path) -> Iterator[None]:
 def replace_file(
     path: Path, content: bytes | memoryview, verify: Callable[[Path], None] = lambda written: None
 ) -> None:
-    """Write a new file next to it, then rename: at every instant and after a power loss, the path is old or new.
+    """Replace a file atomically: at any time, even after a power loss, it has its old or its new content.
 
     Args:
-        path: of the file; a symbolic link is replaced, not followed.
-        content: of the new file.
-        verify: raises where the new file, which it is given, is not to replace the old one.
+        path: file to write. A symbolic link is replaced, not followed.
+        content: new content.
+        verify: function of the temporary file, which raises an error to keep the old file.
 
     Raises:
-        ForbesError: where it cannot be written; the old file, if there is one, is untouched.
+        ForbesError: if the file cannot be written. The old file, if there is one, is unchanged.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")  # nobody can guess it and put a link there
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")  # unpredictable, so no link can be placed there
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -69,9 +69,9 @@ def replace_file(
 
 
 def remove_halves(folder: Path, *names: str) -> None:
-    """Remove what `replace_file` has left of files, or of patterns, in a process that was killed.
+    """Remove temporary files of `replace_file`, by name or pattern, that a killed process has left.
 
-    Call it where no other process can be writing these files.
+    Call it only if no other process can be writing these files.
     """
     for name in names:
         for half in folder.glob(f".{name}.*"):
@@ -79,15 +79,15 @@ def remove_halves(folder: Path, *names: str) -> None:
 
 
 def append_whole(path: Path, content: bytes, sync: bool = False) -> None:
-    """Append to a file, all of it or nothing.
+    """Append to a file, either all of the content or nothing.
 
     Args:
-        path: of the file; it need not exist.
-        content: to append.
-        sync: make it survive a power loss, too.
+        path: file to append to; need not exist.
+        content: content to append.
+        sync: whether it must survive a power loss.
 
     Raises:
-        ForbesError: where it cannot be written, or is a symbolic link.
+        ForbesError: if the file cannot be written, or is a symbolic link.
     """
     with writing(path), open(path, "ab", buffering=0, opener=no_link) as file:
         size = file.tell()
@@ -104,17 +104,17 @@ def append_whole(path: Path, content: bytes, sync: bool = False) -> None:
 
 
 def drop_half_line(path: Path) -> None:
-    """Remove what a kill has left of a line at the end of a file, if there is one."""
+    """Remove an incomplete last line, left by a killed process."""
     if path.is_file():
         with open(path, "rb+", opener=no_link) as file:
             file.truncate(file.read().rfind(b"\n") + 1)
 
 
 def no_link(path: str, flags: int) -> int:
-    """Open a file but not through a symbolic link: `open(path, mode, opener=no_link)`.
+    """Open a file without following a symbolic link: `open(path, mode, opener=no_link)`.
 
     Raises:
-        ForbesError: where the path is one.
+        ForbesError: if the path is a symbolic link.
     """
     try:
         return os.open(path, flags | os.O_NOFOLLOW, 0o666)
@@ -125,36 +125,34 @@ def no_link(path: str, flags: int) -> int:
 
 
 def require_no_links(paths: Iterable[Path]) -> None:
-    """Raise a ForbesError where one of these is a symbolic link: what is written there would go elsewhere."""
+    """Raise a ForbesError if a path is a symbolic link, since data written to it would go elsewhere."""
     for path in paths:
         if path.is_symlink():
             raise _is_link(path)
 
 
 def _is_link(path: Path | str) -> ForbesError:
-    return ForbesError(
-        f"{path}: is a symbolic link, expected what it names itself. Put that in its place, or delete it"
-    )
+    return ForbesError(f"{path}: is a symbolic link, expected a file or folder. Replace it by its target, or delete it")
 
 
 def require_room(folder: Path, what: str, likely: float, least: float = 0) -> None:
-    """Compare what will be written with the room on the disk; warn where it will probably not fit.
+    """Check the free disk space, and warn if the data will probably not fit.
 
     Args:
-        folder: that it will be written to.
-        what: it is, for the sentence: "checkpoints".
-        likely: bytes that it will probably take.
-        least: bytes that it will take for certain.
+        folder: folder to write to.
+        what: name of the data for the message, e.g. "checkpoints".
+        likely: expected number of bytes.
+        least: minimal number of bytes.
 
     Raises:
-        ForbesError: where not even the least of it fits.
+        ForbesError: if not even the minimum fits.
     """
     free = shutil.disk_usage(folder).free
-    there = f"and {_size(free)} are free. Make room, or choose another place"
+    available = f"and {_size(free)} are free. {FULL[errno.ENOSPC]}"
     if free < least:
-        raise ForbesError(f"{folder}: {what} take at least {_size(least)}, {there}")
+        raise ForbesError(f"{folder}: {what} take at least {_size(least)}, {available}")
     if free < likely:
-        warnings.warn(f"{folder}: {what} will take about {_size(likely)}, {there}", stacklevel=2)
+        warnings.warn(f"{folder}: {what} will take about {_size(likely)}, {available}", stacklevel=2)
 
 
 def _size(count: float) -> str:
@@ -162,7 +160,7 @@ def _size(count: float) -> str:
 
 
 def fsync_folder(folder: Path) -> None:
-    """Make a rename in this folder survive a power loss."""
+    """Sync a folder, so that a rename in it survives a power loss."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -172,14 +170,14 @@ def fsync_folder(folder: Path) -> None:
 
 @contextmanager
 def locked(folder: Path, complaint: str) -> Iterator[None]:
-    """Keep every other process from working in this folder; the system frees it when the process dies.
+    """Lock a folder against other processes. The system unlocks it when the process dies.
 
     Args:
-        folder: made where it does not exist.
-        complaint: what is said where another process has it, after the folder and the process: "trains here. …".
+        folder: folder to lock; created if it does not exist.
+        complaint: end of the error message after folder and process, e.g. "trains here. …".
 
     Raises:
-        ForbesError: where another process has it, or a symbolic link is in it.
+        ForbesError: if another process has locked it, or it contains a symbolic link.
     """
     folder.mkdir(parents=True, exist_ok=True)
     require_no_links(folder.rglob("*"))
@@ -189,22 +187,22 @@ def locked(folder: Path, complaint: str) -> Iterator[None]:
         except BlockingIOError as error:
             file.seek(0)
             raise ForbesError(f"{folder}: {file.read().decode()} {complaint}") from error
-        with writing(folder / ".lock"):  # not a new file, which would not be locked
+        with writing(folder / ".lock"):  # not `replace_file`, since a new file would not be locked
             file.truncate(0)
             file.write(f"process {os.getpid()} on {platform.node()}".encode())
         yield
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Return the content of a compressed `.npz` file whose bytes depend on the arrays alone.
+    """Return the content of a compressed `.npz` file whose bytes depend only on the arrays.
 
-    `numpy.savez_compressed` would stamp the members with the time of writing.
+    `numpy.savez_compressed` would store the time of writing.
     """
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, array in arrays.items():
             member = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-            member.create_system = 3  # Unix, also where this runs on Windows
+            member.create_system = 3  # Unix, regardless of the system
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
             archive.writestr(member, buffer.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=9)

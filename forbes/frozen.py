@@ -1,4 +1,4 @@
-"""Build a graph that leaves the parameters of some modules out."""
+"""Build an autograd graph without the parameters of some modules."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,9 +10,10 @@ __all__ = ["frozen"]
 
 @contextmanager
 def frozen(*modules: nn.Module) -> Iterator[None]:
-    """Build a graph through modules that leaves their parameters out; `no_grad` would cut the path to their inputs.
+    """Build a graph through modules that excludes their parameters; `no_grad` would cut the path to their inputs.
 
-    Stand-ins that share their memory take the parameters' places: the compiler cannot follow `requires_grad_`.
+    The parameters are replaced by detached tensors that share their memory, since the compiler cannot trace
+    `requires_grad_`.
     """
     held = [(part, dict(part._parameters)) for module in modules for part in module.modules()]
     for part, parameters in held:

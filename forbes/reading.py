@@ -1,4 +1,4 @@
-"""Files that may be damaged: what they hold, or one sentence that says which file, what is wrong and what to do."""
+"""Read files that may be damaged. Errors are one sentence: which file, what is wrong, what to do."""
 
 import io
 import json
@@ -15,24 +15,24 @@ from forbes.errors import ForbesError
 
 __all__ = ["is_number", "read_json", "read_npz", "read_yaml", "readable", "shortened"]
 
-_REASON = 120  # characters of what a parser says
+_REASON = 120  # characters of a parser's message
 
 
 @contextmanager
 def readable(path: Path | str, kind: str, remedy: str, raises: type[ForbesError] = ForbesError) -> Iterator[None]:
-    """Turn whatever a parser raises on damaged bytes into one sentence.
+    """Turn any error of a parser on damaged bytes into one sentence.
 
-    Parsers raise errors of any class on bytes they were not made for. So all are caught, and nothing but parsing
-    belongs inside.
+    Parsers raise errors of any class on invalid bytes. So all errors are caught, and the `with` block should contain
+    nothing but parsing.
 
     Args:
-        path: of the file.
-        kind: what it should be, e.g. "JSON".
-        remedy: what to do about it, the error's last sentence.
-        raises: the class of the error.
+        path: file that is parsed.
+        kind: expected format, e.g. "JSON".
+        remedy: what to do about it; the last sentence of the error message.
+        raises: class of the error to raise.
 
     Raises:
-        ForbesError: for any error inside.
+        ForbesError: for any error inside the `with` block.
     """
     try:
         yield
@@ -50,7 +50,7 @@ def shortened(text: str, length: int) -> str:
 
 
 def is_number(value: object) -> bool:
-    """Tell whether a value of a JSON file is a number."""
+    """Return whether a value of a JSON file is a number."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 

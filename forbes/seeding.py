@@ -1,10 +1,12 @@
-"""Stateless randomness: a stream is a pure function of (seed, purpose, counter); resuming needs no RNG state."""
+"""Stateless randomness: a stream is a pure function of (seed, purpose, counter), so resuming needs no RNG state."""
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
-__all__ = ["derive_seed", "generator"]
+__all__ = ["derive_seed", "forked", "generator"]
 
 
 def derive_seed(seed: int, purpose: str, counter: int) -> int:
@@ -14,5 +16,14 @@ def derive_seed(seed: int, purpose: str, counter: int) -> int:
 
 
 def generator(seed: int, purpose: str, counter: int) -> torch.Generator:
-    """Return a CPU generator that depends on (seed, purpose, counter) only."""
+    """Return a CPU generator that depends only on (seed, purpose, counter)."""
     return torch.Generator().manual_seed(derive_seed(seed, purpose, counter))
+
+
+@contextmanager
+def forked(device: torch.device | str, seed: int) -> Iterator[None]:
+    """Seed torch's global generators inside the `with` block; restore those of the CPU and of `device` after it."""
+    device = torch.device(device)
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        yield

@@ -1,4 +1,4 @@
-"""How a record of tensors is printed: by the shape and dtype of each, not by its thousands of numbers."""
+"""Print records of tensors by shape and dtype instead of values."""
 
 from typing import Any, TypeVar
 
@@ -8,7 +8,7 @@ Record = TypeVar("Record")
 
 
 def printed_by_shape(record: type[Record]) -> type[Record]:
-    """Let a NamedTuple of tensors or arrays print as `Batch(observation=uint8 (2, 30, 1, 28, 28), ...)`."""
+    """Decorate a NamedTuple of tensors or arrays to print as `Batch(observation=uint8 (2, 30, 1, 28, 28), ...)`."""
 
     def __repr__(self: Any) -> str:  # noqa: N807
         fields = (f"{name}={_summary(getattr(self, name))}" for name in self._fields)
@@ -19,9 +19,9 @@ def printed_by_shape(record: type[Record]) -> type[Record]:
 
 
 def _summary(value: Any) -> str:
-    """Return dtype, shape and device, if it is not the CPU, of a tensor or an array; else the value's own repr."""
+    """Return dtype, shape and device (unless it is the CPU) of a tensor or array, or the repr of another value."""
     if not hasattr(value, "shape"):
         return repr(value)
     device = str(getattr(value, "device", "cpu"))
-    place = "" if device == "cpu" else f" on {device}"
-    return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}{place}"
+    suffix = "" if device == "cpu" else f" on {device}"
+    return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}{suffix}"

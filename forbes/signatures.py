@@ -1,4 +1,4 @@
-"""What a constructor takes where it hands `**kwargs` on to those of its base classes."""
+"""Signatures of constructors that pass `**kwargs` on to their base classes."""
 
 import inspect
 from inspect import Parameter
@@ -7,16 +7,16 @@ __all__ = ["full_signature"]
 
 
 def full_signature(kind: type) -> inspect.Signature:
-    """Return the signature of a class with every argument in it, for `help`, `inspect.signature` and notebooks.
+    """Return the signature of a class with all arguments, for `help`, `inspect.signature` and notebooks.
 
-    The arguments that `**kwargs` hands on to a base class follow those of the class itself, by keyword only.
+    The arguments that `**kwargs` passes on to a base class follow those of the class itself, as keyword-only ones.
     """
-    found: dict[str, Parameter] = {}
+    merged: dict[str, Parameter] = {}
     for base in (base for base in kind.__mro__ if "__init__" in vars(base)):
-        _, *own = inspect.signature(vars(base)["__init__"]).parameters.values()  # without self
-        named = [parameter for parameter in own if parameter.kind is not Parameter.VAR_KEYWORD]
-        new = [parameter for parameter in named if parameter.name not in found]
-        found |= {one.name: one.replace(kind=Parameter.KEYWORD_ONLY if found else one.kind) for one in new}
-        if len(named) == len(own):
+        _, *parameters = inspect.signature(vars(base)["__init__"]).parameters.values()  # without self
+        named = [parameter for parameter in parameters if parameter.kind is not Parameter.VAR_KEYWORD]
+        new = [parameter for parameter in named if parameter.name not in merged]
+        merged |= {p.name: p.replace(kind=Parameter.KEYWORD_ONLY if merged else p.kind) for p in new}
+        if len(named) == len(parameters):
             break
-    return inspect.Signature([*found.values()])
+    return inspect.Signature([*merged.values()])

@@ -18,10 +18,9 @@ FOUNDATION = [
     "densities",
     "frozen",
     "named",
-    "seeding",
-    "shapes",
+    "rounding",
 ]
-FOUNDATION += ["signatures"]
+FOUNDATION += ["seeding", "shapes", "signatures"]
 PACKAGES = ["performance", "beliefs", "models", "control", "pomdps", "envs", "data", "runs", "training", "evaluation"]
 PACKAGES += ["figures", "callbacks", "commands"]
 LINE = [*FOUNDATION, *PACKAGES, "__main__", "__init__"]

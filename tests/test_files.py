@@ -43,7 +43,7 @@ def test_a_run_with_a_link_is_not_resumed(run, precious, capsys, name):
 
     assert main(["fit", "--resume", str(run), "--trainer.max_epochs", "3"]) == 2
 
-    assert f"{run / name}: is a symbolic link, expected what it names itself" in capsys.readouterr().err
+    assert f"{run / name}: is a symbolic link, expected a file or folder" in capsys.readouterr().err
     assert precious.read_bytes() == content
 
 
@@ -80,7 +80,7 @@ def test_a_replaced_link_leaves_what_it_named(tmp_path, precious):
     assert (tmp_path / "report").read_text() == "new"
 
 
-def test_links_at_every_name_that_can_be_guessed_are_not_followed(tmp_path, precious):
+def test_links_at_guessable_names_are_not_followed(tmp_path, precious):
     folder = tmp_path / "folder"
     for name in (".report.part", f".report.{os.getpid()}", "report.part"):
         link(folder / name, precious)

@@ -119,7 +119,7 @@ def test_a_file_that_grows_too_large_is_named_with_a_remedy(name, tmp_path, stro
         assert left_whole(tmp_path / "folder") == set()
 
 
-def test_a_download_that_grows_too_large_is_named_and_goes_on_later(tmp_path):
+def test_a_download_that_grows_too_large_resumes_later(tmp_path):
     content = os.urandom(3 * 2**16)
     (tmp_path / "served").write_bytes(content)
     url, path = (tmp_path / "served").as_uri(), tmp_path / "fetched"
@@ -132,7 +132,7 @@ def test_a_download_that_grows_too_large_is_named_and_goes_on_later(tmp_path):
     assert path.read_bytes() == content
 
 
-def test_a_store_whose_index_is_full_has_whole_episodes_and_takes_more_later(tmp_path):
+def test_a_full_index_keeps_whole_episodes_and_grows_later(tmp_path):
     with small_files(), pytest.raises(ForbesError):
         append_episodes(tmp_path)
     stored = EpisodeStore(tmp_path)
@@ -143,12 +143,16 @@ def test_a_store_whose_index_is_full_has_whole_episodes_and_takes_more_later(tmp
     assert len(EpisodeStore(tmp_path).records) == len(stored.records) + 1
 
 
-REMEDIES = {errno.ENOSPC: "Make room, or", errno.EDQUOT: "Make room in your quota", errno.EFBIG: "Allow larger files"}
+REMEDIES = {
+    errno.ENOSPC: "Free some space, or",
+    errno.EDQUOT: "Free some space in your quota",
+    errno.EFBIG: "Allow larger files",
+}
 
 
 @pytest.mark.parametrize("number", REMEDIES)
 @pytest.mark.parametrize("write", [replace_file, lambda path, content: append_whole(path, content, sync=True)])
-def test_each_kind_of_full_has_its_remedy_and_leaves_the_file_as_it_was(number, write, tmp_path, monkeypatch):
+def test_each_kind_of_full_has_a_remedy_and_changes_no_file(number, write, tmp_path, monkeypatch):
     (tmp_path / "report").write_bytes(b"old")
 
     def full(descriptor):
@@ -171,12 +175,13 @@ def test_a_full_disk_that_another_library_meets_is_one_sentence(monkeypatch, cap
         monkeypatch.setattr("forbes.commands.doctor.main", full)
         assert main(["doctor"]) == 2
         assert (
-            capsys.readouterr().err == f"forbes: {said} (No space left on device). Make room, or choose another place\n"
+            capsys.readouterr().err
+            == f"forbes: {said} (No space left on device). Free some space, or choose another folder\n"
         )
 
 
 @pytest.mark.parametrize("when", range(2, 9))
-def test_a_training_on_a_full_disk_names_the_file_and_goes_on_when_there_is_room(
+def test_training_on_a_full_disk_names_the_file_and_can_resume(
     tiny_config, tiny_run, tmp_path, monkeypatch, capsys, when
 ):
     """The disk is full from the n-th file on, also for what is written because the training has failed."""
@@ -194,7 +199,7 @@ def test_a_training_on_a_full_disk_names_the_file_and_goes_on_when_there_is_room
 
     *_, said = capsys.readouterr().err.splitlines()
     assert said.startswith(f"forbes: {tmp_path / 'run'}/")
-    assert said.endswith("cannot be written (No space left on device). Make room, or choose another place")
+    assert said.endswith("cannot be written (No space left on device). Free some space, or choose another folder")
     first = calls[when - 1]
     name = os.path.basename(first).removeprefix(".").rpartition(".")[0] if "." in os.path.basename(first) else ""
     assert name in said
@@ -252,7 +257,8 @@ def test_a_disk_that_is_really_full_loses_nothing_and_is_named(tmp_path):
     said = json.loads(done.stdout)
     assert len(said) == 3
     assert all(
-        "cannot be written (No space left on device). Make room, or choose another place" in each for each in said
+        "cannot be written (No space left on device). Free some space, or choose another folder" in each
+        for each in said
     )
     assert [part in each for part, each in zip(("/store/", "/metrics.jsonl", "/last.ckpt"), said, strict=True)] == [
         True
@@ -279,7 +285,7 @@ def weights_of(run):
 
 
 @pytest.mark.parametrize(("share", "said"), [(0.9, "refused"), (1.1, "warned"), (11.9, "warned"), (12.1, "fits")])
-def test_a_training_whose_checkpoints_will_not_fit_is_told_before_it_begins(
+def test_checkpoints_that_will_not_fit_are_reported_beforehand(
     share, said, tiny_config, tiny_run, tmp_path, monkeypatch, capsys
 ):
     """Four files, of the weights and two moments for each of them: refused where not even the weights fit."""
@@ -303,18 +309,18 @@ def test_a_checkpoint_has_the_weights_and_two_moments(tiny_run):
 
 
 @pytest.mark.parametrize(("count", "warns"), [(17, False), (22, True)])
-def test_collecting_more_episodes_than_fit_is_said_when_the_first_is_there(count, warns, tmp_path, monkeypatch):
+def test_collecting_more_than_fits_warns_after_one_episode(count, warns, tmp_path, monkeypatch):
     command = ["data", "collect", "--task", "Parrot", "-o", str(tmp_path / "store"), "--episodes"]
     assert forbes(*command, 1) == 0
     size = EpisodeStore(tmp_path / "store").records[0].size
     with free(monkeypatch, 16.5 * size), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert forbes(*command, count) == 0
-    assert any("the episodes to come will take about" in str(each.message) for each in caught) == warns
+    assert any("the remaining episodes will take about" in str(each.message) for each in caught) == warns
 
 
 @pytest.mark.parametrize(("capacity", "more"), [(1000, 2), (24, 1), (16, 0)])
-def test_the_episodes_of_an_agent_are_foreseen_when_the_first_are_there(capacity, more, tmp_path, monkeypatch):
+def test_first_episodes_predict_the_space_an_agent_needs(capacity, more, tmp_path, monkeypatch):
     """Two of 8 steps are followed by two more; a capacity of 24 steps has room for one of them, 16 for none."""
     foreseen = []
     monkeypatch.setattr(collect, "require_room", lambda folder, what, likely: foreseen.append((folder, likely)))

@@ -200,7 +200,7 @@ def test_arguments_take_the_place_of_those_of_a_run(tiny_run):
         forbes.ImaginationActorCritic.load_from_checkpoint(checkpoint)
 
 
-def test_a_model_is_loaded_from_the_checkpoint_of_a_plain_trainer(trained, world):
+def test_a_model_is_loaded_from_a_plain_trainer_checkpoint(trained, world):
     loaded = forbes.WorldModel.load_from_checkpoint(trained)
 
     same_weights(loaded, world)
@@ -208,7 +208,7 @@ def test_a_model_is_loaded_from_the_checkpoint_of_a_plain_trainer(trained, world
     assert (loaded.kl_warmup, loaded.schedule, loaded.seed) == (500, "cosine", 0)
 
 
-def test_arguments_of_any_kind_take_the_place_of_those_of_a_plain_trainer(trained, digits, world):
+def test_arguments_of_any_kind_replace_a_plain_trainers(trained, digits, world):
     belief = forbes.FlowBelief.configured(layers=2, width=4, min_std=0.2)
 
     loaded = forbes.WorldModel.load_from_checkpoint(trained, belief=belief, warmup=7)
@@ -218,7 +218,7 @@ def test_arguments_of_any_kind_take_the_place_of_those_of_a_plain_trainer(traine
     assert loaded.warmup == 7
 
 
-def test_a_checkpoint_of_a_plain_trainer_with_other_sizes_is_one_sentence(trained):
+def test_a_plain_trainer_checkpoint_of_other_sizes_is_refused(trained):
     with pytest.raises(forbes.ForbesError, match=r"plain\.ckpt: its model\.\S+ is .*that of the configured model"):
         forbes.WorldModel.load_from_checkpoint(trained, hidden_dim=9)
 
@@ -247,14 +247,14 @@ def test_what_a_checkpoint_cannot_name_has_to_be_given_again(digits, tmp_path):
     assert loaded.learning_rate == 1e-3
 
 
-def test_arguments_in_a_checkpoint_that_are_no_mapping_are_one_sentence(trained):
+def test_checkpoint_arguments_that_are_no_mapping_are_refused(trained):
     torch.save(torch.load(trained, weights_only=True) | {"hyper_parameters": [1]}, trained)
 
     with pytest.raises(forbes.ForbesError, match=r"plain\.ckpt: its hyper_parameters are a list, expected"):
         forbes.WorldModel.load_from_checkpoint(trained)
 
 
-def test_the_arguments_of_every_kind_of_data_survive_a_checkpoint(tmp_path):
+def test_arguments_of_every_data_source_survive_a_checkpoint(tmp_path):
     for name, source in CONFIGURED.items():
         data = forbes.SequenceDataModule(source())
         world = forbes.WorldModel.for_data(data, model=forbes.ParticleModel.configured(particles=3), kl="monte_carlo")

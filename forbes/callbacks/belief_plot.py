@@ -1,4 +1,4 @@
-"""Prior and posterior beliefs as a digit is written."""
+"""Plot prior and posterior beliefs along a digit."""
 
 import math
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from matplotlib.transforms import blended_transform_factory
 from torch import Tensor
 
 from forbes.beliefs import BeliefHead
-from forbes.callbacks.picture import PictureCallback, require_state, to_device
+from forbes.callbacks.picture import PictureCallback, require_state
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import first_of_each_class
@@ -32,16 +32,16 @@ _DOTS = 200  # samples shown
 class BeliefPlot(PictureCallback):
     """Draws `figures/beliefs.png`: frame, prior p(s_t | h_t) and posterior q(s_t | h_t, o_t) at some steps of a digit.
 
-    Each panel shows density and samples; the prior's also shows, in the posterior's colour, where the posterior lies.
-    With a state of two dimensions the density is exact. With more, samples are shown in the plane of the prior's
-    two leading principal components (with their share of its variance), and the density is a kernel estimate. Of a
-    `ParticleModel` it shows one trajectory of the proposal; a `VectorModel` has no state to plot.
+    Each panel shows density and samples. The prior's panel also shows samples of the posterior, in its colour. For a
+    two-dimensional state the density is exact. Otherwise samples are projected on the prior's two leading principal
+    components (labelled with their fraction of the variance), and the density is a kernel estimate. For a
+    `ParticleModel` it shows one trajectory of the proposal. A `VectorModel` has no state to plot.
 
     Args:
-        digits: how many, the first of each class of the validation split.
-        columns: steps, evenly from the first to the last.
-        samples: of each belief.
-        every: draw after every k-th epoch.
+        digits: number of digits, the first of each class of the validation split.
+        columns: number of steps shown, evenly spaced from the first to the last.
+        samples: number of samples of each belief.
+        every: number of epochs between plots.
     """
 
     filename = "beliefs.png"
@@ -53,15 +53,15 @@ class BeliefPlot(PictureCallback):
         self.digits, self.columns, self.samples = digits, columns, samples
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse a model without a state, before hours are spent."""
+        """Refuse a model without a state when the training starts."""
         require_state(self, pl_module)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
-        """See `PictureCallback`."""
+        """Draw the beliefs along the first digits of the validation split."""
         model = module.model
         assert isinstance(model, StateSpaceModel)
         index = first_of_each_class(data, "validation", self.digits)
-        batch = to_device(data.sequences("validation", index), module)
+        batch = data.sequences("validation", index).to(module.device)
         pictures = data.source.pictures(batch.observation)
         filtered = model.filter(model.embed(batch.observation), batch.action)
         prior_context = model.prior_context(filtered.hidden)  # (B, T, C)
@@ -92,12 +92,12 @@ class BeliefPlot(PictureCallback):
 
 
 class _Cloud(NamedTuple):
-    """Samples of a belief, and its density in the plane."""
+    """Samples of a belief, and its density in a plane."""
 
     samples: Tensor
-    """`(N, D)`, or `(N, 2)` in a plane."""
+    """Samples, `(N, D)`, or `(N, 2)` in a plane."""
     density: Callable[[Tensor, Tensor], Tensor]
-    """On the grid of x, `(X,)`, and y, `(Y,)`: `(Y, X)`."""
+    """Density on a grid: x, `(X,)`, and y, `(Y,)`, to `(Y, X)`."""
 
 
 def _draw_beliefs(above: Axes, below: Axes, prior: _Cloud, posterior: _Cloud, named: bool) -> None:
@@ -135,7 +135,7 @@ def _draw_cloud(axes: Axes, cloud: _Cloud, colour: str, shown: Tensor) -> None:
 
 
 def _legend() -> list[Artist]:
-    """Say what the colours are."""
+    """Return the entries of the legend."""
     samples = (
         Line2D([], [], color=colour, label=label, linestyle="", marker=".", markersize=4)
         for colour, label in ((BLACK, "samples of the density"), (BLUE, "samples of the posterior"))
@@ -152,21 +152,21 @@ def _draw_frame(axes: Axes, observation: Tensor, title: str) -> None:
 
 
 def _principal_plane(prior: Tensor, posterior: Tensor) -> tuple[_Cloud, _Cloud, str]:
-    """Project samples, each `(N, D)`, on the prior's two leading principal components, and name the plane."""
+    """Project samples, each `(N, D)`, on the prior's two leading principal components, and return an axis label."""
     centre = prior.mean(0)
     _, strength, directions = torch.linalg.svd(prior - centre, full_matrices=False)  # (D,), (D, D)
-    share = strength.square() / strength.square().sum()
+    fraction = strength.square() / strength.square().sum()
     planar = [(samples - centre) @ directions[:2].T for samples in (prior, posterior)]  # 2 x (N, 2)
     first, second = (_Cloud(samples, _kernel_density(samples)) for samples in planar)
-    return first, second, f"PC 1 ({share[0]:.0%}), PC 2 ({share[1]:.0%})"
+    return first, second, f"PC 1 ({fraction[0]:.0%}), PC 2 ({fraction[1]:.0%})"
 
 
 def _kernel_density(samples: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
     r"""Estimate a density from samples, `(N, 2)`: Gaussian kernels of width :math:`N^{-1/6}\,\sigma_d` (Scott)."""
     widths = samples.std(0) / math.pow(len(samples), 1 / 6) + 1e-12
 
-    def kernels(places: Tensor, axis: int) -> Tensor:
-        distance = (places[:, None] - samples[:, axis]) / widths[axis]  # (P, N)
+    def kernels(points: Tensor, axis: int) -> Tensor:
+        distance = (points[:, None] - samples[:, axis]) / widths[axis]  # (P, N)
         return distance.square().mul(-0.5).exp() / (math.sqrt(2 * math.pi) * widths[axis])
 
     return lambda x, y: kernels(y, 1) @ kernels(x, 0).T / len(samples)  # (Y, X)

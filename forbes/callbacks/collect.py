@@ -1,4 +1,4 @@
-"""An agent that learns plays: seed episodes at random, then one by its own policy before every epoch."""
+"""Collect episodes during training: seed episodes with random actions, then one by the agent before every epoch."""
 
 import warnings
 from collections.abc import Iterator
@@ -11,6 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from forbes.data import Experience
+from forbes.data.datamodule import datamodule_of
 from forbes.data.episodes.collection import random_policy
 from forbes.data.episodes.episode import Episode
 from forbes.errors import ForbesError, require_at_least
@@ -21,33 +22,33 @@ from forbes.training.acting import AgentPolicy, WorldModelAgent, play_measured
 
 __all__ = ["Collect", "require_agent"]
 
-_AHEAD = 5  # steps: far enough for what actions do to matter, near enough for most episodes
+_AHEAD = 5  # steps: far enough for actions to matter, and available in most episodes
 
 
 class Collect(Callback):
-    r"""Collects the episodes that an agent learns from, and measures how it does.
+    r"""Collects the episodes from which an agent learns, and evaluates the agent.
 
-    When epoch e begins, S + e episodes have been played: S by a random policy, the others by the agent as it then was,
-    with exploration. Episode n is a function of (the training's seed, n) and the weights, so that a resumed run plays
-    the same. The store is the run folder's `episodes/`.
+    At the start of epoch e, S + e episodes have been played: S by a random policy, the others by the agent of that time
+    with exploration. Episode n is a function of (training seed, n) and the weights, so a resumed run plays the same
+    episodes. They are stored in `episodes/` of the run folder.
 
-    With `overlap`, the episode that epoch e + 1 begins with is played during epoch e, by the agent as it was when e
-    began: always one epoch older than it would be otherwise, and so no less reproducible. No other episode is played
-    meanwhile: two processes that render on one GPU may wait for each other for ever.
+    With `overlap`, the episode of epoch e + 1 is played during epoch e, with the weights at the start of e. These are
+    one epoch older than without `overlap`, but just as reproducible. No other episode is played at the same time, since
+    two processes that render on one GPU can deadlock.
 
-    Logs, at the end of the epoch: `env_steps` (frames of the simulator, action repeat included), `agent_steps`,
-    `return/exploring` of the newest episode, and of episodes without exploration, which the agent does not learn from,
-    their mean `return/acting` and `reward_explained/5`, the share of their rewards' variance that the world model
-    foretells 5 steps ahead (`forbes.evaluation.reward_prediction`).
+    Logs at the end of an epoch: `env_steps` (simulator frames, including action repeat), `agent_steps`, and
+    `return/exploring` of the newest episode. Every `evaluate_every` epochs also, over episodes without exploration that
+    are not used for training, the mean `return/acting` and `reward_explained/5`, the R² of the rewards predicted 5
+    steps ahead (`forbes.evaluation.reward_prediction`).
 
     Args:
-        seed_episodes: S.
-        evaluate_every: epochs between two evaluations, of which the last epoch has one.
-        evaluation_episodes: of each; their seeds are those of no other episode, and the same each time.
-        overlap: play in a process of its own, on the CPU, while the agent learns.
+        seed_episodes: number of episodes with random actions, S.
+        evaluate_every: number of epochs between evaluations. The last epoch is always evaluated.
+        evaluation_episodes: number of episodes per evaluation, the same ones every time.
+        overlap: play in a separate process, on the CPU, while the agent learns.
 
     Raises:
-        ForbesError: where a number is below 1; in a fit, where model or data are not those of an agent.
+        ForbesError: if a number is below 1, or, at the start of a fit, if the model is not an agent on `Experience`.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class Collect(Callback):
         self.evaluate_every, self.evaluation_episodes = evaluate_every, evaluation_episodes
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Open the store, before a checkpoint says how far it had come."""
+        """Open the store, before a checkpoint is loaded."""
         require_agent(self, trainer, pl_module)
         self._estimated = False
         if stage == "fit":
@@ -74,23 +75,23 @@ class Collect(Callback):
         _experience(trainer).close()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Close them where the training has been cut off, too."""
-        if isinstance(source := trainer.datamodule.source, Experience):  # type: ignore[attr-defined]
+        """Close them after an error, too."""
+        if isinstance(source := datamodule_of(trainer).source, Experience):
             source.close()
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Play what is missing."""
+        """Play the missing episodes."""
         source, agent = _experience(trainer), cast(WorldModelAgent, pl_module)
-        if trainer.current_epoch == 0:  # a start that was cut off in its first epoch has left no checkpoint to say so
+        if trainer.current_epoch == 0:  # without a checkpoint, keep only the valid seed episodes of an earlier start
             source.watermark = source.begun("random", agent.seed, self.seed_episodes)
-        else:  # nor would a run that goes on from the checkpoint draw from what is forgotten now
+        else:  # a run resumed from the checkpoint would not sample from the episodes deleted now
             source.forget()
         for record in source.collect(self.seed_episodes, random_policy, "random", agent.seed):
-            _say(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
+            _print(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
         with _eval_mode(agent):
             until = self.seed_episodes + trainer.current_epoch
             list(source.collect(until, AgentPolicy(agent, exploring=True), type(agent).__name__, agent.seed))
-        _warn_of_ends(source, agent)
+        _warn_of_termination(source, agent)
         self._estimate_room(trainer)
         steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
         if source.newest.number >= self.seed_episodes:
@@ -98,50 +99,50 @@ class Collect(Callback):
         agent.log_dict(steps, on_step=False, on_epoch=True, batch_size=1)
 
     def _estimate_room(self, trainer: Trainer) -> None:
-        """Warn where the disk will not hold the episodes to come, when the first epoch of this process begins."""
+        """Warn in the first epoch of this process if the disk is too small for the remaining episodes."""
         if not self._estimated and trainer.max_epochs not in (None, -1):
             source, epochs = _experience(trainer), trainer.max_epochs - trainer.current_epoch
-            require_room(Path(trainer.default_root_dir), "the episodes to come", source.growth(epochs - 1))
+            require_room(Path(trainer.default_root_dir), "the remaining episodes", source.growth(epochs - 1))
         self._estimated = True
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
-        """Let the next episode be played, now that other callbacks have played theirs."""
+        """Start the next episode in the background, after other callbacks have played theirs."""
         if self.overlap and batch_idx == 0:
             agent = cast(WorldModelAgent, pl_module)
             _experience(trainer).begin(AgentPolicy.as_it_is(agent, exploring=True), agent.seed)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Store the episode played meanwhile; measure the agent every few epochs, and at the end."""
+        """Store the episode played in the background; evaluate the agent every few epochs, and at the end."""
         agent, source = cast(WorldModelAgent, pl_module), _experience(trainer)
         if self.overlap:
             source.finish(type(agent).__name__, agent.seed)
-        number = trainer.current_epoch + 1
-        if number % self.evaluate_every and number != trainer.max_epochs:
+        epoch = trainer.current_epoch + 1
+        if epoch % self.evaluate_every and epoch != trainer.max_epochs:
             return
         with _eval_mode(agent):
             played = [self.evaluation_episode(trainer, agent, k) for k in range(self.evaluation_episodes)]
-            told = [self._foretold(agent, episode, k) for k, episode in enumerate(played)]
+            predicted = [self._predict_rewards(agent, episode, k) for k, episode in enumerate(played)]
         agent.log("return/acting", sum(episode.total_reward for episode in played) / len(played), batch_size=1)
-        share = r2_score(told, [torch.from_numpy(episode.reward[1:]).double() for episode in played])
-        if share is not None:
-            agent.log(f"reward_explained/{_AHEAD}", share, batch_size=1)
+        r2 = r2_score(predicted, [torch.from_numpy(episode.reward[1:]).double() for episode in played])
+        if r2 is not None:
+            agent.log(f"reward_explained/{_AHEAD}", r2, batch_size=1)
 
     @staticmethod
-    def _foretold(agent: WorldModelAgent, episode: Episode, number: int) -> Tensor:
+    def _predict_rewards(agent: WorldModelAgent, episode: Episode, number: int) -> Tensor:
         seed = derive_seed(agent.seed, "foresight", number)
-        return predict_rewards(agent, episode, seed, f"evaluation episode {number}", (_AHEAD,))[0]
+        return predict_rewards(agent, episode, seed, f"evaluation episode {number}", (_AHEAD,))[_AHEAD]
 
     def evaluation_episode(self, trainer: Trainer, agent: WorldModelAgent, number: int) -> Episode:
-        """Play one of the episodes that measure an agent, in eval mode, while it learns: the same each time."""
+        """Play evaluation episode `number`, the same every time, with the agent in eval mode."""
         return play_measured(agent, _experience(trainer).environment, "evaluation", agent.seed, number)
 
 
-def _warn_of_ends(source: Experience, agent: WorldModelAgent) -> None:
-    """Say so where episodes end by themselves, and the agent imagines that they do not."""
+def _warn_of_termination(source: Experience, agent: WorldModelAgent) -> None:
+    """Warn if an episode terminated, but the agent does not predict termination."""
     if source.newest.terminated and not agent.predicts_termination:
         warnings.warn(
-            f"{source.task}: an episode has ended by itself, and this {type(agent).__name__} imagines that none does. "
-            "An ImaginationActorCritic foresees it with --model.continuation true",
+            f"{source.task}: an episode terminated, but this {type(agent).__name__} does not predict termination. An "
+            "ImaginationActorCritic does with --model.continuation true",
             stacklevel=2,
         )
 
@@ -155,18 +156,17 @@ def _eval_mode(agent: WorldModelAgent) -> Iterator[None]:
 
 
 def _experience(trainer: Trainer) -> Experience:
-    source: Experience = trainer.datamodule.source  # type: ignore[attr-defined]
-    return source
+    return cast(Experience, datamodule_of(trainer).source)
 
 
 def require_agent(callback: Callback, trainer: Trainer, module: LightningModule) -> None:
     """Raise a ForbesError unless an agent learns on Experience."""
-    source = trainer.datamodule.source  # type: ignore[attr-defined]
+    source = datamodule_of(trainer).source
     if not (isinstance(source, Experience) and isinstance(module, WorldModelAgent)):
         name, found = type(callback).__name__, f"{type(module).__name__} on {type(source).__name__}"
-        raise ForbesError(f"{name}: found a {found}, expected an agent on Experience. Leave it out, or change them")
+        raise ForbesError(f"{name}: found a {found}, expected an agent on Experience. Remove it, or change them")
 
 
-def _say(trainer: Trainer, line: str) -> None:
+def _print(trainer: Trainer, line: str) -> None:
     if trainer.is_global_zero:
         print(line, flush=True)

@@ -1,4 +1,4 @@
-"""A training stops before the first update that is not finite, and keeps all that was finite before."""
+"""Stop a training before the first update that is not finite."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,8 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from forbes.data import SequenceDataModule
+from forbes.data.datamodule import datamodule_of
+from forbes.rounding import ceil_div
 from forbes.runs.checkpoint import AtomicCheckpointIO
 from forbes.runs.folder import RunFolder
 from forbes.training.divergence import DivergedError, hold_unless_finite
@@ -19,12 +20,12 @@ __all__ = ["StopAtDivergence"]
 class StopAtDivergence(Callback):
     """Stops a training whose optimiser is held, and refuses checkpoints with parameters that are not finite.
 
-    On a CPU that is right after the update; on a GPU once in each interval of the logger, which waits for the device
-    anyway, and before each checkpoint. `failure.pt` in the run folder has what repeats the update: the weights and the
-    optimiser before it, its batches, and the seed of its noise (`forbes replay`).
+    On a CPU it checks after every update. On a GPU it checks once per logging interval, when Lightning synchronises
+    anyway, and before each checkpoint. `failure.pt` in the run folder then has everything to repeat the update: the
+    weights and the optimiser state before it, its batches, and the seed of its noise (`forbes replay`).
 
     Args:
-        run: where `failure.pt` goes.
+        run: run folder to write `failure.pt` to.
 
     Raises:
         DivergedError: with the number of the update.
@@ -34,53 +35,54 @@ class StopAtDivergence(Callback):
         self.run = run
 
     def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:
-        """Hold the optimiser if the loss is not finite; the module does so for its gradient."""
+        """Hold the optimiser if the loss is not finite. The module does this for the gradient."""
         for optimizer in trainer.optimizers:
             hold_unless_finite(optimizer, loss, trainer.global_step)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: object, batch_idx: int
     ) -> None:
-        """Stop, if a look at the device costs nothing now."""
+        """Stop after a divergence, if the check does not cost an extra synchronisation."""
         interval = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if pl_module.device.type == "cpu" or (interval and trainer.global_step % interval == 0):
             self._stop_if_held(trainer, pl_module)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Stop before the checkpoint."""
+        """Stop after a divergence, before the checkpoint."""
         self._stop_if_held(trainer, pl_module)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Write nothing that a training could not go on from."""
+        """Refuse a checkpoint from which a training could not continue."""
         self._stop_if_held(trainer, pl_module)
         for name, parameter in pl_module.named_parameters():
             if not parameter.isfinite().all():
                 raise DivergedError(
                     f"{self.run}: {name} is not finite after update {trainer.global_step}, so no checkpoint is "
-                    "written; the one before it is untouched. Go on from there with a lower learning rate",
+                    "written; the previous one is unchanged. Resume from it with a lower learning rate",
                     trainer.global_step,
                 )
 
     def _stop_if_held(self, trainer: Trainer, module: LightningModule) -> None:
-        held = min((float(vars(each).get("held_from", math.inf)) for each in trainer.optimizers), default=math.inf)
+        held_from = (float(vars(optimizer).get("held_from", math.inf)) for optimizer in trainer.optimizers)
+        held = min(held_from, default=math.inf)
         if math.isinf(held):
             return
         update = int(held)
-        AtomicCheckpointIO().save_checkpoint(_what_repeats(trainer, module, update), self.run.failure)
-        there = f"forbes fit --resume {self.run}" if self.run.checkpoint.exists() else "the same command"
+        AtomicCheckpointIO().save_checkpoint(_failure_record(trainer, module, update), self.run.failure)
+        command = f"forbes fit --resume {self.run}" if self.run.checkpoint.exists() else "the same command"
         raise DivergedError(
             f"{self.run}: diverged, the loss or gradient of update {update + 1} is not finite. See where: "
-            f"forbes replay {self.run.failure}. Give a lower --model.learning_rate to {there}",
+            f"forbes replay {self.run.failure}. Give a lower --model.learning_rate to {command}",
             update + 1,
         )
 
 
-def _what_repeats(trainer: Trainer, module: LightningModule, update: int) -> dict[str, Any]:
-    """Return plain values and tensors from which an update can be computed again; the weights are those before it."""
-    data: SequenceDataModule = trainer.datamodule  # type: ignore[attr-defined]
+def _failure_record(trainer: Trainer, module: LightningModule, update: int) -> dict[str, Any]:
+    """Return plain values and tensors from which the update can be recomputed, with the weights before it."""
+    data = datamodule_of(trainer)
     numbers = _batches_of(update, int(trainer.num_training_batches), trainer.accumulate_grad_batches)
     drawn: Sequence[int] = numbers
-    if trainer.overfit_batches:  # type: ignore[attr-defined]  # all epochs share theirs
+    if trainer.overfit_batches:  # type: ignore[attr-defined]  # all epochs have the same batches
         drawn = [number % int(trainer.num_training_batches) for number in numbers]
     return {
         "update": update,
@@ -94,8 +96,8 @@ def _what_repeats(trainer: Trainer, module: LightningModule, update: int) -> dic
     }
 
 
-def _batches_of(update: int, an_epoch: int, an_update: int) -> range:
-    """Return the numbers of the batches of an update; the last update of an epoch may have fewer than the others."""
-    epoch, place = divmod(update, -(-an_epoch // an_update))
-    first = place * an_update
-    return range(epoch * an_epoch + first, epoch * an_epoch + min(first + an_update, an_epoch))
+def _batches_of(update: int, per_epoch: int, per_update: int) -> range:
+    """Return the numbers of the batches of an update. The last update of an epoch may have fewer batches."""
+    epoch, in_epoch = divmod(update, ceil_div(per_epoch, per_update))
+    first = in_epoch * per_update
+    return range(epoch * per_epoch + first, epoch * per_epoch + min(first + per_update, per_epoch))

@@ -1,4 +1,4 @@
-"""The bound and its parts while the model learns."""
+"""Plot the bound and its parts during training."""
 
 import pandas as pd
 import torch
@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.callbacks.picture import PictureCallback, to_device
+from forbes.callbacks.picture import PictureCallback
 from forbes.data import SequenceDataModule
 from forbes.evaluation.references import reference_means
 from forbes.figures.style import BLACK, BLUE, GREY, PAGE, draw_references, paper_style, show_settled
@@ -16,19 +16,19 @@ from forbes.training.world_model import WorldModel
 
 __all__ = ["ElboCurve"]
 
-_TITLES = {"kl": "KL", "overshoot": "loss of the roll-out"}
+_TITLES = {"kl": "KL", "overshoot": "rollout loss"}
 
 
 class ElboCurve(PictureCallback):
-    """Draws `figures/elbo.png`: the bound and its parts of both splits against updates, and the KL at each step.
+    """Draws `figures/elbo.png`: the bound and its parts for both splits against updates, and the KL at each step.
 
-    A model without a KL has the loss of its roll-out instead. Dotted is what models without a belief have on the same
-    sequences (`forbes.evaluation.references`). It reads `metrics.jsonl`, so a resumed run shows its
-    whole life.
+    A model without a KL has its rollout loss instead. Dotted lines are scores of models without a belief on the same
+    sequences (`forbes.evaluation.references`). The curves are read from `metrics.jsonl`, so a resumed run shows all of
+    its updates.
 
     Args:
-        sequences: of the validation split, for the KL at each step.
-        every: draw after every k-th epoch.
+        sequences: number of validation sequences for the KL at each step.
+        every: number of epochs between plots.
     """
 
     filename = "elbo.png"
@@ -38,7 +38,7 @@ class ElboCurve(PictureCallback):
         self.sequences = sequences
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
-        """See `PictureCallback`."""
+        """Draw the curves."""
         metrics = read_metrics(str(trainer.log_dir))
         names = [module.objective_name, *module.model.logged_terms]
         has_kl = "kl" in names
@@ -56,14 +56,14 @@ class ElboCurve(PictureCallback):
         return figure
 
     def _references(self, module: WorldModel, data: SequenceDataModule) -> dict[str, float]:
-        """Return the means of the references over the sequences of a validation."""
+        """Return the mean reference scores over the validation sequences."""
         count = min(data.validation_sequences, data.source.size("validation"))
         return reference_means(data, module.model.likelihood, "validation", count)
 
     def _kl_per_step(self, module: WorldModel, data: SequenceDataModule) -> tuple[Tensor, Tensor]:
-        """Average the KL over sequences, each step on its own: mean and standard error, each `(T,)`."""
+        """Return mean and standard error over sequences of the KL at each step, each `(T,)`."""
         index = torch.arange(min(self.sequences, data.source.size("validation")))
-        batches = [to_device(data.sequences("validation", part), module) for part in index.split(data.batch_size)]
+        batches = [data.sequences("validation", part).to(module.device) for part in index.split(data.batch_size)]
         terms = [module.terms(batch) for batch in batches]
         kl = torch.cat([term.kl.masked_fill(~term.mask, torch.nan) for term in terms]).cpu()  # (B, T)
         count = kl.isfinite().sum(0)
@@ -72,7 +72,7 @@ class ElboCurve(PictureCallback):
 
 
 def _draw_curves(axes: Axes, metrics: pd.DataFrame, name: str) -> None:
-    """Draw one metric of both splits."""
+    """Draw one metric for both splits."""
     curves = []
     for split, label, colour in [("train", "train", GREY), ("val", "validation", BLUE)]:
         if f"{split}/{name}" in metrics:

@@ -1,4 +1,4 @@
-"""An agent in an episode, as a video."""
+"""Record an episode of an agent as a video."""
 
 from pathlib import Path
 from typing import cast
@@ -17,13 +17,13 @@ __all__ = ["EpisodeVideo"]
 
 
 class EpisodeVideo(FileCallback):
-    """Writes `figures/episode.gif`: an episode without exploration, the first of those that `Collect` measures by.
+    """Writes `figures/episode.gif`: an episode without exploration, the first evaluation episode of `Collect`.
 
     Args:
-        every: play after every k-th epoch.
+        every: number of epochs between videos.
 
     Raises:
-        ForbesError: in a fit, where no agent learns, or the observations are not images.
+        ForbesError: at the start of a fit, if the model is not an agent, or the observations are not images.
     """
 
     filename = "episode.gif"
@@ -32,13 +32,13 @@ class EpisodeVideo(FileCallback):
         super().__init__(every)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse what cannot be filmed, before hours are spent."""
+        """Refuse models and data that cannot be recorded when the training starts."""
         require_agent(self, trainer, pl_module)
         require_frames(self, trainer)
 
     def write(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule, path: Path) -> None:
-        """See `FileCallback`."""
-        callbacks = trainer.callbacks  # type: ignore[attr-defined]  # Lightning gives it no type
+        """Play the episode and write the GIF."""
+        callbacks = trainer.callbacks  # type: ignore[attr-defined]  # untyped in Lightning
         collect = next(callback for callback in callbacks if isinstance(callback, Collect))
         episode = collect.evaluation_episode(trainer, cast(WorldModelAgent, module), 0)
         replace_file(path, gif([episode.observation]))

@@ -1,4 +1,4 @@
-"""Frames that a model reconstructs, then imagines, under the true ones (as in Dreamer's summaries)."""
+"""Draw frames that a model reconstructs, then imagines, below the true frames (as in Dreamer's summaries)."""
 
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
@@ -12,7 +12,7 @@ from forbes.callbacks.picture import (
 )
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
-from forbes.evaluation.predictions import open_loop
+from forbes.evaluation.predictions import open_loop_frames
 from forbes.figures import imagination
 from forbes.models import StateSpaceModel
 from forbes.training.world_model import WorldModel
@@ -21,19 +21,20 @@ __all__ = ["OpenLoopPanel"]
 
 
 class OpenLoopPanel(PictureCallback):
-    """Draws `figures/open_loop.png`: truth, model and error of some sequences, a column a step.
+    """Draws `figures/open_loop.png`: truth, model and error of some sequences, one column per step.
 
-    The model sees the first frames and reconstructs them; from its belief there it imagines the others by the actions
-    that were taken, one trajectory of each sequence. `shown_sequences` says which these are.
+    The model sees and reconstructs the first frames. From its belief after them it imagines the others for the recorded
+    actions, one trajectory per sequence. The sequences are those of `shown_sequences`.
 
     Args:
-        sequences: how many.
-        context: frames that the model sees.
-        columns: frames shown, those of the context among them; the others evenly to the module's length.
-        every: draw after every k-th epoch.
+        sequences: number of sequences.
+        context: number of frames that the model sees.
+        columns: number of frames shown: all of the context, the others evenly spaced to the last.
+        every: number of epochs between figures.
 
     Raises:
-        ForbesError: where a number cannot be; in a fit, for vectors, or a model without a state.
+        ForbesError: if a number is too small, or, at the start of a fit, if the observations are not images or the
+            model has no state.
     """
 
     filename = "open_loop.png"
@@ -45,16 +46,16 @@ class OpenLoopPanel(PictureCallback):
         self.sequences, self.context, self.columns = sequences, context, columns
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse what cannot be drawn, before hours are spent."""
+        """Refuse models and data that cannot be drawn when the training starts."""
         require_frames(self, trainer)
         require_state(self, pl_module)
         require_context(self, trainer, self.context)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
-        """See `PictureCallback`."""
+        """Draw truth, model and error."""
         model = module.model
         assert isinstance(model, StateSpaceModel)
         batch = shown_sequences(data, self.sequences, module)
         truth = data.source.pictures(model.likelihood.picture(batch.observation))  # (B, T, C, H, W)
-        expected = data.source.pictures(open_loop(model, batch, self.context))
-        return imagination.open_loop(truth, expected, batch.mask, self.context, self.columns)
+        expected = data.source.pictures(open_loop_frames(model, batch, self.context))
+        return imagination.draw_open_loop(truth, expected, batch.mask, self.context, self.columns)

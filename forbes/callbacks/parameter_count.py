@@ -1,4 +1,4 @@
-"""The size of a model, part by part."""
+"""Print the number of parameters of each part of a model."""
 
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
@@ -7,16 +7,16 @@ from torch import nn
 __all__ = ["ParameterCount", "count_parameters"]
 
 _PARTS = {"transition": "recurrence", "gru": "recurrence", "nothing": "recurrence"}
-_PARTS |= {"prior_context": "prior", "posterior_context": "posterior"}  # the contexts belong to their belief
+_PARTS |= {"prior_context": "prior", "posterior_context": "posterior"}  # context networks belong to their belief
 
 
 class ParameterCount(Callback):
-    """Prints the parameters of each part as a fit starts, and logs their total as the metric `parameters`."""
+    """Prints the number of parameters of each part at the start of a fit, and logs their total as `parameters`."""
 
     @rank_zero_only
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Print and log."""
-        parts = count_parameters(pl_module.model)  # type: ignore[arg-type]  # a WorldModel's
+        """Print the numbers, and log the total."""
+        parts = count_parameters(pl_module.model)  # type: ignore[arg-type]  # pl_module is a WorldModel
         for part, number in parts.items():
             print(f"{part:<12}{number:>12,} parameters", flush=True)
         for logger in trainer.loggers:
@@ -24,7 +24,7 @@ class ParameterCount(Callback):
 
 
 def count_parameters(model: nn.Module) -> dict[str, int]:
-    """Count by part, in the model's order, and the whole."""
+    """Return the number of parameters of each part, in the order of the model, and the `total`."""
     parts: dict[str, int] = {}
     for name, parameter in model.named_parameters():
         part = name.partition(".")[0]

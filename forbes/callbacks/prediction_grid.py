@@ -1,9 +1,9 @@
-"""Sampled completions of validation digits while the model learns (paper, Figure 4)."""
+"""Draw sampled completions of validation digits during training (paper, Figure 4)."""
 
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.callbacks.picture import PictureCallback, require_context, require_frames, to_device
+from forbes.callbacks.picture import PictureCallback, require_context, require_frames
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
@@ -15,17 +15,17 @@ __all__ = ["PredictionGrid"]
 
 
 class PredictionGrid(PictureCallback):
-    """Draws `figures/predictions.png`: true digit | some of the frames seen | N sampled completions.
+    """Draws `figures/predictions.png`: true digit | some of the observed frames | N sampled completions.
 
-    A row a digit: the first of each class of the validation split, then the second. Completions are shown at the
-    module's own length and, where digits go on, at the end of the longest; a column is one trajectory. Of written
-    strokes each completion is a drawing, one pixel a step.
+    Each row is a digit: the first of each class of the validation split, then the second. Completions are shown at the
+    training length and, if digits are longer, at the end of the longest. Each column is one trajectory. For written
+    strokes a completion is a binary drawing, one pixel per step.
 
     Args:
-        digits: rows.
-        samples: N.
-        context: frames that the model sees.
-        every: draw after every k-th epoch.
+        digits: number of digits.
+        samples: number of completions, N.
+        context: number of frames that the model sees.
+        every: number of epochs between figures.
     """
 
     filename = "predictions.png"
@@ -36,14 +36,14 @@ class PredictionGrid(PictureCallback):
         self.digits, self.samples, self.context = digits, samples, context
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse what cannot be drawn, before hours are spent."""
+        """Refuse data that cannot be drawn when the training starts."""
         require_frames(self, trainer)
         require_context(self, trainer, self.context)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
-        """See `PictureCallback`."""
+        """Draw the digits and their completions."""
         index = first_of_each_class(data, "validation", self.digits)
-        batch = to_device(whole_sequences(data, "validation", index), module)
+        batch = whole_sequences(data, "validation", index).to(module.device)
         times = sorted({data.length, batch.observation.shape[1]})
         completions = complete(module.model, data.source, batch, self.context, self.samples)
         sampled = [

@@ -1,4 +1,4 @@
-"""What an agent earns while it learns."""
+"""Plot the returns of an agent during training."""
 
 import pandas as pd
 from lightning import LightningModule, Trainer
@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from forbes.callbacks.collect import require_agent
 from forbes.callbacks.picture import PictureCallback
 from forbes.data import Experience, SequenceDataModule
+from forbes.data.datamodule import datamodule_of
 from forbes.figures.returns import published_curves, return_curve
 from forbes.runs.folder import read_metrics
 from forbes.training.world_model import WorldModel
@@ -15,17 +16,17 @@ __all__ = ["ReturnCurve"]
 
 
 class ReturnCurve(PictureCallback):
-    """Draws `figures/return.png`: what `Collect` logs, `return/acting` and `return/exploring`, against `env_steps`.
+    """Draws `figures/return.png`: the `return/acting` and `return/exploring` of `Collect` against `env_steps`.
 
-    It reads `metrics.jsonl`, so a resumed run shows its whole life.
+    The curves are read from `metrics.jsonl`, so a resumed run shows all of its epochs.
 
     Args:
-        reference: a file of published curves of the same task, to draw beside it; see `published_curves`. By default
-            those of `forbes data fetch curves`, where they are there and have the task.
-        every: draw after every k-th epoch.
+        reference: file of published curves of the same task to compare with; its format is that of `published_curves`.
+            Default: those of `forbes data fetch curves`, if they are stored and include the task.
+        every: number of epochs between plots.
 
     Raises:
-        ForbesError: in a fit, where no agent learns, or the file is not one of curves, or lacks the task.
+        ForbesError: at the start of a fit, if the model is not an agent, or the file is invalid or lacks the task.
     """
 
     filename = "return.png"
@@ -35,17 +36,17 @@ class ReturnCurve(PictureCallback):
         self.reference = reference
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse what cannot be drawn, before hours are spent."""
+        """Refuse models and files that cannot be drawn when the training starts."""
         require_agent(self, trainer, pl_module)
-        self._published(trainer.datamodule)  # type: ignore[attr-defined]  # Lightning gives it no type
+        self._published(datamodule_of(trainer))
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
-        """See `PictureCallback`."""
+        """Draw the returns."""
         task, published = self._published(data)
         return return_curve(read_metrics(str(trainer.log_dir)), task, published)
 
     def _published(self, data: SequenceDataModule) -> tuple[str, dict[str, list[pd.Series]]]:
-        """Return the task, and what others have published of it."""
+        """Return the task, and its published curves."""
         source = data.source
         assert isinstance(source, Experience)
         return source.task, published_curves(self.reference, source.task)

@@ -1,1 +1,1 @@
-"""Commands: one file for each; `parsers/` has their arguments, free of torch, so that `--help` is fast."""
+"""The commands, one file each. Their arguments are in `parsers/`, which does not import torch, so `--help` is fast."""

@@ -1,4 +1,4 @@
-"""Arguments of the commands that Lightning does not parse: what is wrong with them is said in one sentence."""
+"""Argument parsing for the commands that Lightning does not parse. Errors are one sentence."""
 
 import argparse
 from typing import NoReturn
@@ -17,19 +17,19 @@ class ArgumentParser(argparse.ArgumentParser):
         super().__init__(prog, description=description, epilog=epilog, formatter_class=raw)
 
     def error(self, message: str) -> NoReturn:
-        """Raise instead of printing the usage and leaving."""
+        """Raise `ForbesError` instead of printing the usage and exiting."""
         raise ForbesError(f"{self.prog}: {message}. See {self.prog} --help")
 
 
 def positive(text: str) -> int:
-    """Parse a number that counts something; for `type=`."""
+    """Parse a positive integer (an argparse type)."""
     if not text.isascii() or not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
     return int(text)
 
 
 def seconds(text: str) -> float:
-    """Parse how long to wait; for `type=`."""
+    """Parse a positive number of seconds (an argparse type)."""
     try:
         value = float(text)
     except ValueError:

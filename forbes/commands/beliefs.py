@@ -1,17 +1,15 @@
-"""`forbes beliefs`: how far learned beliefs of a known process are from its exact one."""
+"""`forbes beliefs`: compare learned beliefs of a known process with the exact ones."""
 
-import sys
 import time
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import torch
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
+from forbes.commands.console import console
 from forbes.commands.parsers.beliefs import parser
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.errors import ForbesError
@@ -22,25 +20,25 @@ from forbes.evaluation.runs import data_name, data_sha256, split_batches
 from forbes.evaluation.scores import Increments
 from forbes.evaluation.scoring import Scores, require_finite, with_progress
 from forbes.pomdps import ExactFilter
-from forbes.runs.provenance import command_line, commit
-from forbes.seeding import derive_seed, generator
+from forbes.runs.provenance import command_line, origin
+from forbes.seeding import derive_seed, forked, generator
 from forbes.training import KnownBelief
 from forbes.training.known_belief import has_transition_density
 from forbes.training.loading import load_known_belief
 
 __all__ = ["main"]
 
-_ROWS = 10  # sequences at a time: on a fine grid half a million cells
+_ROWS = 10  # sequences per batch: half a million cells on a fine grid
 
 
 class _Run(NamedTuple):
-    """A learned belief, in float64 like the exact one, and its data."""
+    """A learned belief, in float64 as the exact one, and its data."""
 
     path: str
     module: KnownBelief
     data: SequenceDataModule
     checkpoint: str
-    """SHA-256 of the checkpoint that the module was read from."""
+    """SHA-256 of the checkpoint that the module was loaded from."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -54,21 +52,17 @@ def main(argv: Sequence[str]) -> None:
     for run in runs:
         began = time.monotonic()
         scores = _learned(run, args)
-        origin = {
-            "command": command_line("beliefs", *argv),
-            "commit": commit(),
-            "seed": args.seed,
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        about = origin(command_line("beliefs", *argv), args.seed) | {
             "data": {"name": data_name(run.data), "sha256": sha256},
             "checkpoint": run.checkpoint,
             "seconds": round(time.monotonic() - began, 1),
         }
         names = {metric: _metric_name(run, args, metric) for metric in scores.values}
-        entries = {name: _describe(scores, metric) | origin for metric, name in names.items()}
+        entries = {name: _describe(scores, metric) | about for metric, name in names.items()}
         write_record(folders[run.path], entries, {name: scores.values[metric].sum(1) for metric, name in names.items()})
         table.add_row(*_row(run.path, f"{type(run.module.model.head).__name__}, {run.module.objective}", scores))
     table.add_row(*_row("", "moment-matched Gaussian", _matched(runs[0], args)))
-    Console(width=None if sys.stdout.isatty() else 200).print(table)
+    console(200).print(table)
 
 
 def _load(path: str) -> _Run:
@@ -78,13 +72,13 @@ def _load(path: str) -> _Run:
 
 
 def _same_data(runs: Sequence[_Run], args: Any) -> str:
-    """Return the hash of the sequences; refuse runs with others, or with too few."""
+    """Return the hash of the sequences; refuse runs with other data or too few sequences."""
     hashes = []
     for run in runs:
         size = run.data.source.size(args.split)
         if not 2 <= args.sequences <= size:
             raise ForbesError(
-                f"--sequences {args.sequences}: the {args.split} split of {run.path} has {size}, expected 2 to that"
+                f"--sequences {args.sequences}: the {args.split} split of {run.path} has {size}, expected 2 to {size}"
             )
         hashes.append(data_sha256(run.data, args.split, args.sequences))
         if hashes[-1] != hashes[0]:
@@ -96,17 +90,16 @@ def _same_data(runs: Sequence[_Run], args: Any) -> str:
 
 
 def _score(run: _Run, args: Any, name: str, compare: Callable[[int, SequenceBatch, ExactFilter], Increments]) -> Scores:
-    """Compare beliefs with the exact ones, some sequences at a time, all in float64."""
+    """Compare beliefs with the exact ones, batch by batch, all in float64."""
     parts, masks = [], []
-    with torch.random.fork_rng([]), torch.no_grad():
-        batches = split_batches(run.data, args.split, args.sequences, _ROWS)
-        for first, batch in with_progress(batches, f"{run.path} {name}", args.sequences):
-            observation, action, state = batch.observation.double(), batch.action.double(), batch.state.double()
-            exact = run.module.process.exact_filter(observation, action)
-            torch.manual_seed(derive_seed(args.seed, "beliefs", first))
-            batch = batch._replace(observation=observation, action=action, state=state)
+    batches = split_batches(run.data, args.split, args.sequences, _ROWS)
+    for first, batch in with_progress(batches, f"{run.path} {name}", args.sequences):
+        observation, action, state = batch.observation.double(), batch.action.double(), batch.state.double()
+        exact = run.module.process.exact_filter(observation, action)
+        batch = batch._replace(observation=observation, action=action, state=state)
+        with forked("cpu", derive_seed(args.seed, "beliefs", first)), torch.no_grad():
             parts.append(compare(first, batch, exact))
-            masks.append(batch.mask)
+        masks.append(batch.mask)
     return Scores({name: torch.cat([part[name] for part in parts]) for name in parts[0]}, torch.cat(masks))
 
 
@@ -116,7 +109,7 @@ def _compare(run: _Run, args: Any, first: int, batch: SequenceBatch, exact: Exac
 
 
 def _learned(run: _Run, args: Any) -> Scores:
-    """Measure what a run has learned."""
+    """Return the errors of a run's learned beliefs."""
     model, has_elbo = run.module.model, has_transition_density(run.module.process)
 
     def compare(first: int, batch: SequenceBatch, exact: ExactFilter) -> Increments:
@@ -135,7 +128,7 @@ def _learned(run: _Run, args: Any) -> Scores:
 
 
 def _matched(run: _Run, args: Any) -> Scores:
-    """Measure the Gaussian of the exact belief's mean and variance."""
+    """Return the errors of the Gaussian with the exact belief's mean and variance."""
 
     def compare(first: int, batch: SequenceBatch, exact: ExactFilter) -> Increments:
         return _compare(run, args, first, batch, exact, moment_matched(exact.belief))
@@ -144,7 +137,7 @@ def _matched(run: _Run, args: Any) -> Scores:
 
 
 def _metric_name(run: _Run, args: Any, metric: str) -> str:
-    """Name a metric in full: `test[:200]/forward_kl[S=100]`."""
+    """Return the full name of a metric, e.g. `test[:200]/forward_kl[S=100]`."""
     whole = args.sequences == run.data.source.size(args.split)
     return f"{args.split}{'' if whole else f'[:{args.sequences}]'}/{metric}[S={args.samples}]"
 
@@ -161,7 +154,7 @@ def _table(args: Any) -> Table:
 
 
 def _row(name: str, belief: str, scores: Scores) -> list[str]:
-    """Return a row of the table; a metric that a process or a belief does not have is left empty."""
+    """Return a row of the table, with empty cells for metrics that the process or belief does not have."""
     cells = []
     for metric in (*ERRORS, "elbo_gap"):
         values = scores.values.get(metric)
@@ -170,23 +163,23 @@ def _row(name: str, belief: str, scores: Scores) -> list[str]:
 
 
 def _cell(totals: Tensor, steps: Tensor) -> str:
-    """Write the mean over all steps, or the share of sequences in which it is infinite."""
-    if share := _share_infinite(totals):
-        return f"inf in {share:.1%}"
-    each = Estimate.per_step(totals, steps)
-    return f"{each.mean:.3f} ± {each.standard_error:.3f}"
+    """Return the mean over all steps, or the fraction of sequences in which it is infinite, as text."""
+    if fraction := _fraction_infinite(totals):
+        return f"inf in {fraction:.1%}"
+    per_step = Estimate.per_step(totals, steps)
+    return f"{per_step.mean:.3f} ± {per_step.standard_error:.3f}"
 
 
 def _describe(scores: Scores, metric: str) -> dict[str, Any]:
-    """Return the entry of `evaluation.json`, where JSON has no infinity: the mean is null where it is infinite."""
-    share = _share_infinite(scores.total(metric))
-    if share == 0:
-        return describe(scores, metric) | {"infinite": share}
+    """Return the entry of `evaluation.json`. JSON has no infinity, so an infinite mean is null."""
+    fraction = _fraction_infinite(scores.total(metric))
+    if fraction == 0:
+        return describe(scores, metric) | {"infinite": fraction}
     unknown = {"mean": None, "standard_error": None}
     counts = {"sequences": len(scores.mask), "steps": int(scores.steps.sum())}
-    return {**unknown, "per_step": unknown, **counts, "infinite": share}
+    return {**unknown, "per_step": unknown, **counts, "infinite": fraction}
 
 
-def _share_infinite(totals: Tensor) -> float:
-    """Return the share of sequences with an infinite score, `(N,)`."""
+def _fraction_infinite(totals: Tensor) -> float:
+    """Return the fraction of sequences with an infinite score, `(N,)`."""
     return totals.isinf().double().mean().item()

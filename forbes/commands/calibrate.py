@@ -1,14 +1,13 @@
-"""`forbes calibrate`: whether a trained model's filter is the exact one of its own process."""
+"""`forbes calibrate`: check whether a trained model's filter is exact for the model's own process."""
 
-import sys
 from collections.abc import Sequence
 from itertools import cycle
 
 import torch
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from forbes.commands.console import console
 from forbes.commands.parsers.calibrate import parser
 from forbes.errors import ForbesError
 from forbes.evaluation.calibration.ranks import coverage
@@ -16,7 +15,7 @@ from forbes.evaluation.calibration.self_calibration import SelfCalibration, self
 from forbes.evaluation.calibration.uniformity import kolmogorov_smirnov, pearson, spread
 from forbes.evaluation.runs import TrainedRun, load_runs, run_titles
 from forbes.figures.calibration import RankedBelief, calibration
-from forbes.figures.style import PALETTE, save_figure
+from forbes.figures.style import PALETTE, save_png_and_pdf
 from forbes.models import StateSpaceModel
 from forbes.seeding import generator
 
@@ -34,13 +33,11 @@ def main(argv: Sequence[str]) -> None:
         for title, colour, one in zip(run_titles(runs), cycle(PALETTE), found, strict=False)
     ]
     figure = calibration(beliefs, args.samples)
-    for suffix in (".png", ".pdf"):
-        save_figure(figure, args.output / f"calibration{suffix}")
-        print(args.output / f"calibration{suffix}")
+    print(*save_png_and_pdf(figure, args.output, "calibration"), sep="\n")
 
 
 def _check(run: TrainedRun, sequences: int, time: int, samples: int, seed: int) -> SelfCalibration:
-    """Check one run; actions are those of its training split, from the first sequence on."""
+    """Check one run, with the actions of the first sequences of its training split."""
     if not isinstance(run.model, StateSpaceModel):
         raise ForbesError(f"{run.path}: a {run.family} model has no state that could be ranked. Name other runs")
     size = run.data.source.size("train")
@@ -51,12 +48,12 @@ def _check(run: TrainedRun, sequences: int, time: int, samples: int, seed: int) 
     action = run.data.sequences("train", torch.arange(sequences), time).action
     try:
         return self_calibration(run.model, action, samples, seed)
-    except ForbesError as error:  # where the training has diverged, say
+    except ForbesError as error:  # e.g. if the training diverged
         raise ForbesError(f"{run.path}: {error}") from error
 
 
 def _print(runs: Sequence[TrainedRun], found: Sequence[SelfCalibration], samples: int) -> None:
-    table = Table(title=f"{len(found[0].density)} states drawn from the model, ranked among {samples} of the belief")
+    table = Table(title=f"{len(found[0].density)} states sampled from the model, ranked among {samples} of the belief")
     for header in ("run", "family"):
         table.add_column(header, overflow="fold")
     for header in ("within 90 %", "p, density", "p, TARP", "p, values (smallest of D, times D)", "p, classifier"):
@@ -68,4 +65,4 @@ def _print(runs: Sequence[TrainedRun], found: Sequence[SelfCalibration], samples
         tarp = kolmogorov_smirnov(spread(one.tarp, samples, generator(0, "spread", 0))).item()
         p_values = (pearson(one.density, samples).item(), tarp, values, one.classifier.p_value)
         table.add_row(escape(run.path), run.family, f"{within:.1%}", *(f"{p:.2g}" for p in p_values))
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    console(160).print(table)

@@ -1,4 +1,4 @@
-"""The command `forbes`: lists what there is, hands over to the command asked for, and prints errors as one sentence."""
+"""The command `forbes`: list the commands, dispatch to one of them, and print errors as one sentence."""
 
 import argparse
 import difflib
@@ -16,7 +16,7 @@ __all__ = ["main"]
 
 
 class Command(NamedTuple):
-    """What a command does, how one calls it, and the function that runs it: `module:function(arguments)`."""
+    """Summary and example of a command, and the function that runs it as `module:function(arguments)`."""
 
     summary: str
     example: str
@@ -29,51 +29,51 @@ COMMANDS = {
     "validate": Command("run the validation loop of a model", _TRAINED, "forbes.commands.fit:validate"),
     "test": Command("run the test loop of a model", _TRAINED, "forbes.commands.fit:test"),
     "predict": Command("run the prediction loop of a model", _TRAINED, "forbes.commands.fit:predict"),
-    "replay": Command("show where a training has diverged", "RUN/failure.pt", "forbes.commands.replay:main"),
-    "evaluate": Command("measure trained models and compare them", "RUN RUN", "forbes.commands.evaluate:main"),
-    "rollout": Command("film an agent", "RUN --video agent.gif", "forbes.commands.rollout:main"),
+    "replay": Command("show where a training diverged", "RUN/failure.pt", "forbes.commands.replay:main"),
+    "evaluate": Command("evaluate trained models and compare them", "RUN RUN", "forbes.commands.evaluate:main"),
+    "rollout": Command("record an agent as a GIF", "RUN --video agent.gif", "forbes.commands.rollout:main"),
     "beliefs": Command("compare learned beliefs with exact ones", "RUN RUN", "forbes.commands.beliefs:main"),
     "theorem": Command("check Theorem 1 in closed form", "--steps 30", "forbes.commands.theorem:main"),
     "compare": Command(
-        "train and measure configurations alike",
+        "train several configurations and compare them",
         "configs/strokes/rssm.yaml configs/strokes/forbes.yaml --seeds 3",
         "forbes.commands.compare:main",
     ),
     "calibrate": Command("check a filter against its own model", "RUN -o figures", "forbes.commands.calibrate:main"),
     "completions": Command(
-        "measure how precise and diverse predicted digits are",
+        "score sampled digit completions",
         "RUN RUN -o figures",
         "forbes.commands.completions:main",
     ),
     "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.commands.figures:main"),
     "data": Command(
-        "fetch, build, collect and look at data", "show strokes -o strokes.png", "forbes.commands.parsers.data:main"
+        "fetch, build, collect and show data", "show strokes -o strokes.png", "forbes.commands.parsers.data:main"
     ),
-    "doctor": Command("say what this machine has and lacks", "", "forbes.commands.doctor:main"),
+    "doctor": Command("check this machine's software and hardware", "", "forbes.commands.doctor:main"),
 }
 
 HELP = """\
 usage: forbes COMMAND ...
 
-Learn, measure and use belief states of partially observable processes.
+Learn, evaluate and use belief states of partially observable processes.
 
-commands, each with an example (RUN is a folder that `forbes fit` has made):
+commands, each with an example (RUN is a run folder written by `forbes fit`):
 {commands}
 options:
-  --help               this page; after a command, its own
-  --version            the version
+  --help               show this page, or that of a command
+  --version            show the version
   --debug              with any command: show the traceback of an error
-  --allow-module NAME  with any command: let configurations name classes of this Python module too
+  --allow-module NAME  with any command: allow configurations to use classes of this Python module
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status.
 
-    That is 0, 2 for an error the user can mend, 3 for a training that diverged, 130 or 143 for a signal.
+    The status is 0, 2 for an error that the user can fix, 3 for a training that diverged, 130 or 143 for a signal.
 
     Args:
-        arguments: without the program's name; those of the process by default.
+        arguments: command line without the program's name. Default: that of the process.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    """Answer --help and --version, or hand over."""
+    """Handle --help and --version, or run a command."""
     modules = _take_modules(arguments)
     if not arguments or arguments[0] in ("--help", "-h", "help"):
         print(_help(), end="")
@@ -111,7 +111,7 @@ def _run(arguments: list[str]) -> int:
         if (page := _asked_help(name, rest)) is not None:
             print(page, end="")
             return 0
-    else:  # help and mistakes are told before anything heavy is imported
+    else:  # help and wrong arguments are reported before anything heavy is imported
         _parser(name).parse_args(list(itertools.takewhile("--".__ne__, rest)))
     module, function = COMMANDS[name].target.split(":")
     command: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
@@ -119,36 +119,36 @@ def _run(arguments: list[str]) -> int:
 
 
 def _asked_help(name: str, arguments: list[str]) -> str | None:
-    """Return the help of a command that Lightning parses, if it is asked for; remove `all`, which asks Lightning."""
-    place = next((place for place, argument in enumerate(arguments) if argument in ("--help", "-h")), None)
-    if place is None:
+    """Return the short help page of a Lightning command if requested. For `--help all`, leave it to Lightning."""
+    position = next((i for i, argument in enumerate(arguments) if argument in ("--help", "-h")), None)
+    if position is None:
         return None
-    if arguments[place + 1 : place + 2] == ["all"]:
-        del arguments[place + 1]
+    if arguments[position + 1 : position + 2] == ["all"]:
+        del arguments[position + 1]
         return None
     return help_page(name)
 
 
 def _parser(name: str) -> argparse.ArgumentParser:
-    """Return the parser of another command, of the module of its name."""
+    """Return the parser of a command that Lightning does not parse."""
     parser: argparse.ArgumentParser = importlib.import_module(f"forbes.commands.parsers.{name}").parser()
     return parser
 
 
 def _take_modules(arguments: list[str]) -> list[str]:
-    """Remove each `--allow-module NAME` from the arguments and give the names."""
+    """Remove each `--allow-module NAME` from the arguments and return the names."""
     modules = []
     while "--allow-module" in arguments:
-        place = arguments.index("--allow-module")
-        if place + 1 == len(arguments):
-            raise ForbesError("--allow-module: no name follows. Name a Python module")
-        modules.append(arguments[place + 1])
-        del arguments[place : place + 2]
+        position = arguments.index("--allow-module")
+        if position + 1 == len(arguments):
+            raise ForbesError("--allow-module: the name is missing. Name a Python module")
+        modules.append(arguments[position + 1])
+        del arguments[position : position + 2]
     return modules
 
 
 def _help() -> str:
-    """List the commands."""
+    """Return the help page with the list of commands."""
     rows = []
     for name, command in COMMANDS.items():
         rows += [f"  {name:<11} {command.summary}", f"              forbes {name} {command.example}".rstrip(), ""]
@@ -156,7 +156,7 @@ def _help() -> str:
 
 
 def _sentence(error: Exception) -> str:
-    """Say a missing file, a full disk and the like as shortly as our own errors."""
+    """Return the message of an error; an `OSError`, e.g. a missing file, is described in one sentence too."""
     if isinstance(error, OSError) and error.errno in FULL:
         return str(unwritable(error.filename or "the output", error))
     if isinstance(error, OSError) and error.filename is not None:

@@ -1,4 +1,4 @@
-"""`forbes data collect`: episodes that a random policy plays, or an agent that has learned."""
+"""`forbes data collect`: collect episodes of a random policy or a trained agent."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,17 +23,17 @@ _RANDOM = "random"
 
 
 def collect(output: Path, episodes: int, policy: str, seed: int, **environment: Any) -> None:
-    """Play episodes in a process of its own, and store them; interrupted, it goes on where it stopped.
+    """Play episodes in a separate process and store them. If interrupted, the same call resumes.
 
     Args:
-        output: folder of the store.
-        episodes: how many have been stored in the end, those of earlier calls included.
-        policy: "random", or the run folder of an agent, which explores as in its training.
-        seed: episode n is a function of (seed, n) and the policy.
-        environment: task, options of its constructor, seconds for an answer and most steps; None where it is not said.
+        output: folder of the episode store.
+        episodes: number of stored episodes at the end, including those of earlier calls.
+        policy: "random", or the run folder of an agent, which explores as in training.
+        seed: random seed. Episode n is a function of (seed, n) and the policy.
+        environment: task, options of its constructor, timeout in seconds and time limit in steps; None for a default.
 
     Raises:
-        ForbesError: where there is no such task or run, an agent is given another task, or an episode breaks.
+        ForbesError: if the task or run does not exist, if an agent is given a task, or if an episode fails.
     """
     given = {name: value for name, value in environment.items() if value is not None}
     with _acting(policy, given) as (played_in, make_policy), EpisodeWriter(output) as writer:
@@ -42,19 +42,19 @@ def collect(output: Path, episodes: int, policy: str, seed: int, **environment: 
         records: list[EpisodeRecord] = []
         for record in track(played, f"Playing {played_in.describe()['task']}", total=missing):
             if not records:
-                require_room(output, "the episodes to come", (missing - 1) * record.size)
+                require_room(output, "the remaining episodes", (missing - 1) * record.size)
             records.append(record)
     print(f"{output}: {len(records)} episodes stored, {count_steps(records)}; {writer.watermark} in all")
 
 
 @contextmanager
 def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, MakePolicy]]:
-    """Return who acts, and where: an agent in the environment of its run."""
+    """Yield the environment and the policy; an agent acts in the environment of its run."""
     if policy != _RANDOM:
         if given:
             flag = "--" + min(given).replace("_", "-")
             raise ForbesError(
-                f"--policy {policy}: an agent acts in the environment of its run, expected no {flag}. Leave it out"
+                f"--policy {policy}: an agent acts in the environment of its run, expected no {flag}. Remove it"
             )
         with loaded_agent(policy, "cpu") as (agent, environment, _):
             yield environment, AgentPolicy(agent, exploring=True)

@@ -1,4 +1,4 @@
-"""`forbes compare`: train several configurations under several seeds, measure them alike, and put them side by side."""
+"""`forbes compare`: train several configurations with several seeds, evaluate them, and compare the results."""
 
 import json
 import subprocess
@@ -10,9 +10,9 @@ from typing import Any
 
 import pandas as pd
 import yaml
-from rich.console import Console
 from rich.markdown import Markdown
 
+from forbes.commands.console import console
 from forbes.commands.evaluate import evaluate, wanted_metrics
 from forbes.commands.jobs import Job, run_jobs
 from forbes.commands.parsers.compare import parser
@@ -20,8 +20,8 @@ from forbes.errors import ForbesError
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record
 from forbes.evaluation.runs import load_runs
-from forbes.figures.comparison import differences, per_step, scores
-from forbes.figures.style import save_figure
+from forbes.figures.comparison import draw_differences, draw_per_step, draw_scores
+from forbes.figures.style import save_png_and_pdf
 from forbes.files import replace_file
 from forbes.runs.checkpoint import open_checkpoint
 from forbes.runs.configuration import allowed_modules
@@ -51,23 +51,23 @@ def main(argv: Sequence[str]) -> None:
     loaded = load_runs([of_config[0] for of_config in folders.values()])
     wanted = wanted_metrics(loaded, args)
     families = [
-        Family(name, folders[name], run.parameters, [metric for metric, has in metrics.items() if not has])
+        Family(name, folders[name], run.parameters, metrics.lacks)
         for name, run, metrics in zip(folders, loaded, wanted, strict=True)
     ]
     missing = [
         run
         for family, metrics in zip(families, wanted, strict=True)
         for run in family.runs.values()
-        if not _is_measured(run, [metric for metric, has in metrics.items() if has], args.seed)
+        if not _is_measured(run, metrics.has, args.seed)
     ]
     if missing:
         evaluate(missing, args, command)
-    comparison = compare(families, [metric for metric in wanted[0] if any(has[metric] for has in wanted)])
+    comparison = compare(families, [name for name in wanted[0].names if any(name in metrics.has for metrics in wanted)])
     _write(comparison, families, args.output, command)
 
 
 def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, dict[int, str]]:
-    """Name each configuration after its file, and its runs by seed."""
+    """Return the run folders of each configuration by seed; a configuration is named after its file."""
     names = [Path(config).stem for config in configs]
     for config, name in zip(configs, names, strict=True):
         if not Path(config).is_file():
@@ -78,7 +78,7 @@ def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, 
 
 
 def _train(runs: Sequence[tuple[str, int, str]], flags: Sequence[str], at_once: int) -> None:
-    """Train runs, given as (configuration, seed, folder), to their ends; a finished one is left at once."""
+    """Train all runs, given as (configuration, seed, folder), to the end. Finished runs return at once."""
     jobs = []
     for config, seed, run in runs:
         if RunFolder(run).checkpoint.exists():
@@ -90,28 +90,28 @@ def _train(runs: Sequence[tuple[str, int, str]], flags: Sequence[str], at_once: 
     failed = {run: status for run, status in run_jobs(jobs, at_once).items() if status != 0}
     if failed:
         ends = ", ".join(f"{run} with status {status}" for run, status in failed.items())
-        raise ForbesError(f"trainings that failed: {ends}. Mend that (above), then give the same command again")
+        raise ForbesError(f"trainings that failed: {ends}. Fix the errors above, then repeat the command")
 
 
 def _require_same_configuration(run: str, config: str, seed: int, flags: Sequence[str]) -> None:
-    """Refuse a run that was trained otherwise: unequal updates, say, would be compared unseen.
+    """Refuse a run that was trained with another configuration, e.g. with fewer updates.
 
-    Callbacks do not count, since they watch; nor do keys that the run's version of this package did not have.
+    Callbacks may differ, since they only observe. Keys that the run's version of this package did not have are ignored.
     """
-    own = _flat(read_config(RunFolder(run).config))
-    own |= {key: str(Path(own[key]).absolute()) for key in own if key.endswith(".path") and own[key]}
+    trained = _flat(read_config(RunFolder(run).config))
+    trained |= {key: str(Path(trained[key]).absolute()) for key in trained if key.endswith(".path") and trained[key]}
     asked = _flat(yaml.safe_load(_configuration(config, *flags))) | {key: seed for key in _SEEDS}
     asked |= {key: str(Path(asked[key]).absolute()) for key in asked if key.endswith(".path") and asked[key]}
     for key in asked:
-        if key in own and own[key] != asked[key] and key != "trainer.callbacks":
+        if key in trained and trained[key] != asked[key] and key != "trainer.callbacks":
             raise ForbesError(
-                f"{run}: was trained with {key} = {own[key]}, expected {asked[key]}. Give the configuration and flags "
-                "it had, or another folder, -o"
+                f"{run}: was trained with {key} = {trained[key]}, expected {asked[key]}. Use its configuration and "
+                "flags, or another folder, -o"
             )
 
 
 def _flat(section: Any, name: str = "") -> dict[str, Any]:
-    """Name every value by the keys that lead to it: `model.init_args.state_dim`."""
+    """Flatten a nested section: every value by its dotted key, e.g. `model.init_args.state_dim`."""
     if not isinstance(section, dict):
         return {name: section}
     return {k: v for key, value in section.items() for k, v in _flat(value, f"{name}.{key}".strip(".")).items()}
@@ -119,28 +119,28 @@ def _flat(section: Any, name: str = "") -> dict[str, Any]:
 
 @cache
 def _configuration(config: str, *flags: str) -> str:
-    """Ask `forbes fit` for the whole configuration it would train by."""
+    """Return the complete configuration that `forbes fit` would train with, as YAML."""
     command = _fit_command(["--config", config, *flags, "--print_config"])
     asked = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if asked.returncode != 0:
-        raise ForbesError(f"{config}: `forbes fit` cannot train by it (above). Mend it")
+        raise ForbesError(f"{config}: `forbes fit` cannot train with it, see the error above. Fix it")
     return asked.stdout
 
 
 def _fit_command(arguments: Sequence[str]) -> list[str]:
-    """Return the command of a `forbes fit` in a process of its own: trainings leave nothing behind in one another."""
+    """Return the command of a `forbes fit` in its own process, so that trainings do not affect each other."""
     return [sys.executable, "-m", "forbes", *allowed_modules(), "fit", *arguments]
 
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:
-    """Tell whether every metric is recorded of the run's present checkpoint, with this seed of the noise."""
+    """Return whether every metric is recorded for the run's current checkpoint and this random seed."""
     record, checkpoint = read_record(run), open_checkpoint(RunFolder(run).checkpoint).sha256
     entries = [record.get(metric, {}) for metric in metrics]
     return all(entry.get("checkpoint") == checkpoint and entry.get("seed") == seed for entry in entries)
 
 
 def _write(comparison: Comparison, families: Sequence[Family], folder: Path, command: str) -> None:
-    """Write tables and pictures, and print the table."""
+    """Write tables and figures, and print the table."""
     text = markdown(comparison, families)
     tables = {name: _records(getattr(comparison, name)) for name in ("scores", "differences")}
     record = {
@@ -153,19 +153,18 @@ def _write(comparison: Comparison, families: Sequence[Family], folder: Path, com
     replace_file(folder / "comparison.csv", comparison.scores.to_csv(index=False).encode())
     replace_file(folder / "comparison.json", (json.dumps(record, indent=2) + "\n").encode())
     replace_file(folder / "comparison.md", text.encode())
-    figures = {"scores": scores(comparison)}
-    if steps := per_step(comparison):
+    figures = {"scores": draw_scores(comparison)}
+    if steps := draw_per_step(comparison):
         figures["per-step"] = steps
     if len(comparison.differences):
-        figures["differences"] = differences(comparison, families[0].name)
+        figures["differences"] = draw_differences(comparison, families[0].name)
     for name, figure in figures.items():
-        for suffix in (".png", ".pdf"):
-            save_figure(figure, folder / f"{name}{suffix}")
-    Console(width=None if sys.stdout.isatty() else 200).print(Markdown(text))
+        save_png_and_pdf(figure, folder, name)
+    console(200).print(Markdown(text))
     print(f"comparison.csv, .json, .md and {', '.join(figures)} are in {folder}")
 
 
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows, empty numbers as null: JSON has no NaN."""
+    """Return the rows of a table for JSON, with None for NaN."""
     rows: list[dict[str, Any]] = table.astype(object).where(table.notna(), None).to_dict("records")
     return rows

@@ -1,26 +1,31 @@
-"""`forbes completions`: whether predictions of digits are precise yet diverse, in numbers and in pictures."""
+"""`forbes completions`: score and draw sampled completions of digits."""
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
+from rich.markup import escape
+from rich.table import Table
 
+from forbes.commands.console import console
 from forbes.commands.parsers.completions import parser
 from forbes.data import Strokes
 from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, load_classifiers
 from forbes.errors import ForbesError
-from forbes.evaluation.digits.completions import prefixes
-from forbes.evaluation.digits.study import Study, entries, print_study, study
+from forbes.evaluation.digits.completions import select_prefixes
+from forbes.evaluation.digits.study import Row, Study, entries, study
+from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
-from forbes.figures.completions import by_ambiguity, drawings, errors, scores
-from forbes.figures.style import save_figure
+from forbes.figures.completions import by_ambiguity, draw_class_scores, draw_completions, draw_errors
+from forbes.figures.style import save_png_and_pdf
 from forbes.files import replace_file
 from forbes.runs.provenance import command_line, commit
 
 __all__ = ["main"]
 
-_DRAWN = 10  # digits in a picture
+_DRAWN = 10  # digits per figure
 
 
 def main(argv: Sequence[str]) -> None:
@@ -32,13 +37,13 @@ def main(argv: Sequence[str]) -> None:
     hashes = [data_sha256(run.data, args.split, args.sequences) for run in runs]
     require_comparable(runs, hashes)
     assert isinstance(data.source, Strokes)
-    judges = load_classifiers(data.source.origin)
+    classifiers = load_classifiers(data.source.origin)
     named = dict(zip(run_titles(runs), runs, strict=True))
     studies = []
     for context in sorted(set(args.prefixes)):
-        beginnings = prefixes(data, args.split, args.sequences, context, judges.prefix)
-        studies.append(study(named, judges, beginnings, args.split, args.samples, args.seed))
-        print_study(studies[-1], data.length)
+        chosen = select_prefixes(data, args.split, args.sequences, context, classifiers.prefix)
+        studies.append(study(named, classifiers, chosen, args.split, args.samples, args.seed))
+        _print(studies[-1], data.length)
     record = {
         "command": command_line("completions", *argv),
         "commit": commit(),
@@ -52,7 +57,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _check(args: Any, runs: Sequence[TrainedRun]) -> None:
-    """Say what does not fit before minutes are spent."""
+    """Check the arguments before minutes are spent."""
     for run in runs:
         if not isinstance(run.data.source, Strokes):
             raise ForbesError(f"{run.path}: its data are {data_name(run.data)}, expected Strokes. Name other runs")
@@ -74,7 +79,7 @@ def _describe(name: str, run: TrainedRun) -> dict[str, Any]:
 
 
 def _write(args: Any, record: dict[str, Any], studies: Sequence[Study]) -> None:
-    """Write every score with its paired differences, and the curves over n."""
+    """Write all scores, paired differences, and the curves over n."""
     found = [entry for one in studies for entry in entries(one, f"{args.split}[:{args.sequences}]")]
     curves = [
         {"row": row.name, "c": one.prefixes.context, "best": row.best, "average": row.average}
@@ -87,16 +92,74 @@ def _write(args: Any, record: dict[str, Any], studies: Sequence[Study]) -> None:
 
 
 def _draw(args: Any, runs: Sequence[TrainedRun], studies: Sequence[Study]) -> None:
-    figures = {"completions-scores": scores(studies), "completions-errors": errors(studies)}
+    figures = {"completions-scores": draw_class_scores(studies), "completions-errors": draw_errors(studies)}
     for one in studies:
         place = by_ambiguity(one.prefixes.reference, _DRAWN)
         end = int(one.prefixes.steps[place].max())
         batch = runs[0].data.sequences(args.split, one.prefixes.digits[place], end)
         models = [run.model for run in runs]
-        figures[f"completions-c{one.prefixes.context}"] = drawings(
+        figures[f"completions-c{one.prefixes.context}"] = draw_completions(
             one, models, runs[0].data.source, batch, place, args.seed
         )
     for name, figure in figures.items():
-        for suffix in (".png", ".pdf"):
-            save_figure(figure, args.output / f"{name}{suffix}")
+        save_png_and_pdf(figure, args.output, name)
     print(f"completions.json, .csv and {', '.join(figures)} are in {args.output}")
+
+
+def _print(study: Study, length: int) -> None:
+    """Print a table of class scores and a table of pixel scores."""
+    title = f"{len(study.prefixes.digits)} digits, {study.prefixes.context} steps seen, {study.samples} completions"
+    of_classes = {
+        "js[end]": "JS to the\nreference",
+        "entropy[end]": "entropy",
+        "entropy_gap[end]": "entropy\ngap",
+        "nll[end]": "−log p of\nthe label",
+        "ece[end]": "ECE",
+        "classes[end]": "classes\nabove 5 %",
+        "clear[end]": "clear\ndigits",
+        "kept[60%]": "class kept\nfrom 60 %",
+        "kept[80%]": "class kept\nfrom 80 %",
+    }
+    of_pixels = {
+        f"energy[t<={length}]": f"energy score\nt ≤ {length}",
+        "energy[end]": "energy score\nend",
+        f"crps[t<={length}]": f"CRPS\nt ≤ {length}",
+        "crps[end]": "CRPS\nend",
+        "grey[end]": "grey\nink",
+        "error[end]": "error\nof one",
+        "best[end]": f"error of the\nbest of {study.samples}",
+        "average[end]": f"error of the\naverage of {study.samples}",
+    }
+    screen = console(160)
+    screen.print(
+        _table(
+            study,
+            f"{title}: their classes, nats",
+            of_classes,
+            [*study.runs, study.reference, study.similar, study.truth],
+        )
+    )
+    screen.print(_table(study, f"{title}: their pixels", of_pixels, [*study.runs, study.similar, study.truth]))
+
+
+def _table(study: Study, title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> Table:
+    table = Table(title=title)
+    table.add_column("", overflow="fold")
+    for header in columns.values():
+        table.add_column(header, justify="right")
+    for row in rows:
+        values = {score: _cell(Estimate.of(each)) for score, each in row.scores.items()}
+        values["ece[end]"] = f"{row.calibration:.3f}"
+        table.add_row(escape(row.name), *(values.get(score, "") for score in columns))
+    table.add_section()
+    for one, other, scores in study.differences:
+        values = {score: _cell(each, sign="+") for score, each in scores.items()}
+        table.add_row(escape(f"{one.name} − {other.name}"), *(values.get(score, "") for score in columns))
+    return table
+
+
+def _cell(estimate: Estimate, sign: str = "") -> str:
+    """Write a mean above its standard error."""
+    if not math.isfinite(estimate.mean):
+        return "n/a"
+    return f"{estimate.mean:{sign}.3f}\n± {estimate.standard_error:.3f}"

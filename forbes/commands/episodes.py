@@ -1,4 +1,4 @@
-"""`forbes data info` and `check`: the episodes of an environment, counted and verified."""
+"""`forbes data info` and `check`: describe and verify stored episodes."""
 
 from collections import Counter
 from pathlib import Path
@@ -15,11 +15,12 @@ __all__ = ["check", "count_steps", "info"]
 
 
 def info(path: Path, output: Path | None = None) -> None:
-    """Print what a store of episodes holds, and draw the frames of three of them.
+    """Print a summary of an episode store, and draw frames of three episodes.
 
     Args:
         path: folder of the store.
-        output: picture to write, by default `frames.png` in the folder; only images of at most four channels are drawn.
+        output: image file to write. Default: `frames.png` in the folder. Only images with at most four channels are
+            drawn.
     """
     store = EpisodeStore(path)
     store.require_episodes()
@@ -36,7 +37,7 @@ def info(path: Path, output: Path | None = None) -> None:
 
 
 def _facts(store: EpisodeStore, records: list[EpisodeRecord]) -> list[tuple[str, str]]:
-    """Say what there is, by name; records in the order of their returns."""
+    """Return the summary as (name, value) pairs; `records` are sorted by return."""
     returns = np.array([record.total_reward for record in records])
     facts = [(name, str(value)) for name, value in records[-1].environment.items() if name != "made_by"]
     made_by = Counter(
@@ -49,23 +50,23 @@ def _facts(store: EpisodeStore, records: list[EpisodeRecord]) -> list[tuple[str,
         ("policies", ", ".join(f"{name}: {count} episodes" for name, count in policies.items())),
         (
             "episodes",
-            f"{len(records)}, of {store.watermark} ever stored; {sum(r.terminated for r in records)} terminated",
+            f"{len(records)} of {store.watermark} ever stored; {sum(r.terminated for r in records)} terminated",
         ),
         ("steps", count_steps(records)),
-        ("on the disk", f"{sum(record.size for record in records) / 2**20:.1f} MiB"),
+        ("size on disk", f"{sum(record.size for record in records) / 2**20:.1f} MiB"),
         ("return", _spread(returns)),
     ]
     rewards, actions = [], []
     for episode in map(store.episode, store.records):
         rewards.append(episode.reward[1:].copy())  # a view would keep the file open
         actions.append(episode.action[1:].copy())
-    facts.append(("reward of a step", _spread(np.concatenate(rewards))))
+    facts.append(("reward per step", _spread(np.concatenate(rewards))))
     columns = np.concatenate(actions).T  # (A, steps)
-    return facts + [(f"action {place}", _spread(column)) for place, column in enumerate(columns)]
+    return facts + [(f"action {index}", _spread(column)) for index, column in enumerate(columns)]
 
 
 def check(path: Path) -> int:
-    """Verify every file of a store of episodes, and put damaged ones aside; 1 if there were any.
+    """Verify every file of an episode store, and move damaged ones to `quarantine/`. Return 1 if there were any.
 
     Args:
         path: folder of the store.
@@ -78,12 +79,12 @@ def check(path: Path) -> int:
         for number, reason in damage.items():
             writer.quarantine(number)
             print(f"{writer.file(number)}: damaged ({reason}), moved to {path / 'quarantine'}")
-    print(f"{path}: {count} episodes read, {count - len(damage)} whole, {len(damage)} damaged")
+    print(f"{path}: {count} episodes read, {count - len(damage)} intact, {len(damage)} damaged")
     return int(bool(damage))
 
 
 def count_steps(records: list[EpisodeRecord]) -> str:
-    """Keep the two kinds of steps apart."""
+    """Return the number of agent steps and of env steps, in words."""
     steps, frames = sum(record.steps for record in records), sum(record.frames for record in records)
     return f"{steps:,} agent steps, {frames:,} env steps (frames, with action repeat)"
 

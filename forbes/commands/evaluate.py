@@ -1,10 +1,9 @@
-"""`forbes evaluate`: bounds and proper scores of trained models, and the paired difference of each two."""
+"""`forbes evaluate`: bounds and proper scores of trained models, with paired differences."""
 
 import itertools
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from forbes.data import Simulated
 from forbes.errors import ForbesError
 from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.estimates import Estimate
-from forbes.evaluation.metrics import SCORES, EvaluatedRun, note, pair
+from forbes.evaluation.metrics import SCORES, EvaluatedRun, compare_pairs, record_differences
 from forbes.evaluation.record import describe, require_readable, results_folders, write_record
 from forbes.evaluation.references import references
 from forbes.evaluation.round_trip import model_round_trip, print_round_trip
@@ -32,19 +31,20 @@ from forbes.evaluation.runs import (
     split_batches,
 )
 from forbes.evaluation.scoring import PartialScores, Scorer, exact_scorer, make_scorer, score_split, with_progress
-from forbes.runs.provenance import command_line, commit
+from forbes.runs.provenance import command_line, origin
 
-__all__ = ["evaluate", "main", "wanted_metrics"]
+__all__ = ["WantedMetrics", "evaluate", "main", "wanted_metrics"]
 
 
 class _Job(NamedTuple):
-    """A pass over the first so many sequences of a split."""
+    """A scorer and the number of sequences that it scores."""
 
     name: str
     score: Scorer
     sequences: int
+    """Number of sequences, from the first of the split."""
     sha256: list[str]
-    """Of the sequences, as each run's data give them."""
+    """Hash of the sequences in each run's data."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -62,20 +62,20 @@ def main(argv: Sequence[str]) -> None:
     print_runs(measured)
     print_references(measured)
     if len(measured) > 1:
-        print_pairs(pair(measured))
+        print_pairs(compare_pairs(measured))
     print_degradation(measured)
 
 
 def evaluate(
     paths: Sequence[str], args: Any, command: str, folders: Mapping[str, Path] | None = None
 ) -> list[EvaluatedRun]:
-    """Measure runs on the same sequences and record it.
+    """Evaluate runs on the same sequences and record the results.
 
     Args:
         paths: run folders.
-        args: with the options of `forbes.commands.parsers.evaluate.add_score_options`.
-        command: for the record.
-        folders: where the record of each run goes; into the run by default.
+        args: parsed options of `forbes.commands.parsers.evaluate.add_score_options`.
+        command: command line, for the record.
+        folders: folder for the record of each run. Default: the run folder itself.
     """
     folders = folders or results_folders(paths)
     require_readable(folders.values())
@@ -84,96 +84,113 @@ def evaluate(
     finished: list[PartialScores] = []
     measured = []
     for number, run in enumerate(runs):
-        one = EvaluatedRun(run, {}, {})
+        evaluated = EvaluatedRun(run, {}, {})
         for job in _of(run, jobs):
-            finished.append(_measure(one, job, job.sha256[number], args, folders[run.path]))
-        _add_references(one, jobs, args.split)
-        for entry in one.entries.values():
-            date = datetime.now(UTC).isoformat(timespec="seconds")
-            entry.update(command=command, commit=commit(), seed=args.seed, date=date, parameters=run.parameters)
-        measured.append(one)
-    for first, second, differences in pair(measured):
-        note(first, second, differences)
-    for one in measured:
-        write_record(folders[one.run.path], one.entries | _round_trip(one.run, args), one.totals)
+            finished.append(_measure(evaluated, job, job.sha256[number], args, folders[run.path]))
+        _add_references(evaluated, jobs, args.split)
+        for entry in evaluated.entries.values():
+            entry.update(origin(command, args.seed), parameters=run.parameters)
+        measured.append(evaluated)
+    for first, second, differences in compare_pairs(measured):
+        record_differences(first, second, differences)
+    for evaluated in measured:
+        write_record(
+            folders[evaluated.run.path], evaluated.entries | _round_trip(evaluated.run, args), evaluated.totals
+        )
     for parts in finished:
         parts.remove()
     return measured
 
 
-def _add_references(one: EvaluatedRun, jobs: Sequence[_Job], split: Split) -> None:
-    """Put beside each score what references have on the same steps of the same sequences."""
+def _add_references(evaluated: EvaluatedRun, jobs: Sequence[_Job], split: Split) -> None:
+    """Add to each score the scores of the reference models on the same steps of the same sequences."""
     found: dict[int, dict[str, Tensor]] = {}
-    for job in _of(one.run, jobs):
+    for job in _of(evaluated.run, jobs):
         scores = [metric for metric in job.score.metrics if metric in SCORES]
         if scores and job.sequences not in found:
-            found[job.sequences] = references(one.run.data, one.run.model.likelihood, split, job.sequences)
+            found[job.sequences] = references(evaluated.run.data, evaluated.run.model.likelihood, split, job.sequences)
         for metric in scores:
-            one.entries[_metric_name(one.run, job, metric, split)]["references"] = {
+            evaluated.entries[_metric_name(evaluated.run, job, metric, split)]["references"] = {
                 name: Estimate.of(values[:, job.score.context :].sum(1))._asdict()
                 for name, values in found[job.sequences].items()
             }
 
 
-def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[dict[str, bool]]:
-    """Name the metrics that `evaluate` measures runs by, and tell for each run whether its model has them."""
+class WantedMetrics(NamedTuple):
+    """The metrics of `evaluate` for a run, by full name."""
+
+    names: list[str]
+    """All metrics, in their order."""
+    has: list[str]
+    """Those that the run's model has."""
+
+    @property
+    def lacks(self) -> list[str]:
+        """Metrics that the run's model does not have."""
+        return [name for name in self.names if name not in self.has]
+
+
+def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[WantedMetrics]:
+    """Return the metrics of `evaluate` for each run."""
     jobs = _jobs(args, runs)
-    return [
-        {
-            _metric_name(run, job, metric, args.split): metric in job.score.of(run.model).metrics
-            for job in jobs
-            for metric in job.score.metrics
-        }
-        for run in runs
-    ]
+    return [WantedMetrics(_names(run, jobs, args.split), _names(run, _of(run, jobs), args.split)) for run in runs]
+
+
+def _names(run: TrainedRun, jobs: Sequence[_Job], split: str) -> list[str]:
+    return [_metric_name(run, job, metric, split) for job in jobs for metric in job.score.metrics]
 
 
 def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
-    """Say which passes to make, on how many sequences; refuse runs that cannot be compared there."""
-    numbers = {name: getattr(args, option) for name, option in PASSES.items()}
-    wanted = {
-        name: make_scorer(name, numbers[name], args.batch_size, args.context) for name in PASSES if name in args.scores
-    }
-    if not any(score.of(run.model).metrics for run in runs for score in wanted.values()):
+    """Return the scorers with their sequences; refuse runs that cannot be scored or compared."""
+    numbers = {name: getattr(args, option) for name, option in PASSES.items() if name in args.scores}
+    scorers = {name: make_scorer(name, number, args.batch_size, args.context) for name, number in numbers.items()}
+    _require_scores(runs, scorers, numbers)
+    if isinstance(source := runs[0].data.source, Simulated):
+        scorers = {"exact": exact_scorer(source.process)} | scorers
+    counts = {name: _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else SUBSET) for name in scorers}
+    hashes = {count: _require_same_data(runs, args, count) for count in dict.fromkeys(counts.values())}
+    if "open-loop" in counts:
+        _require_longer(runs[0], args, counts["open-loop"])
+    return [_Job(name, scorer, counts[name], hashes[counts[name]]) for name, scorer in scorers.items()]
+
+
+def _require_scores(runs: Sequence[TrainedRun], scorers: Mapping[str, Scorer], numbers: Mapping[str, int]) -> None:
+    """Refuse scores that no model has, and numbers of particles or futures that a model cannot use."""
+    if not any(scorer.of(run.model).metrics for run in runs for scorer in scorers.values()):
         raise ForbesError(
-            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(wanted)} score, its likelihood is exact. "
+            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(scorers)} score, its likelihood is exact. "
             "Ask for --scores pll or open-loop"
         )
-    for run, name in itertools.product(runs, [name for name in ("pll", "open-loop") if name in wanted]):
-        run.model.num_belief_samples(numbers[name])  # a number that cannot be is said before minutes are spent
-    if isinstance(source := runs[0].data.source, Simulated):
-        wanted = {"exact": exact_scorer(source.process)} | wanted
-    hashes: dict[int, list[str]] = {}
-    jobs = []
-    for name, score in wanted.items():
-        count = _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else SUBSET)
-        if count not in hashes:
-            for run in runs:
-                _count(run, args, count)
-            hashes[count] = [data_sha256(run.data, args.split, count) for run in runs]
-            require_comparable(runs, hashes[count])
-        jobs.append(_Job(name, score, count, hashes[count]))
-        if name == "open-loop":
-            _require_longer(runs[0], args, count)
-    return jobs
+    for run, name in itertools.product(runs, ("pll", "open-loop")):
+        if name in numbers:
+            run.model.num_belief_samples(numbers[name])
+
+
+def _require_same_data(runs: Sequence[TrainedRun], args: Any, count: int) -> list[str]:
+    """Return the hash of the first sequences in each run's data; refuse runs that are not comparable."""
+    for run in runs:
+        _count(run, args, count)
+    hashes = [data_sha256(run.data, args.split, count) for run in runs]
+    require_comparable(runs, hashes)
+    return hashes
 
 
 def _require_longer(run: TrainedRun, args: Any, count: int) -> None:
-    """Refuse sequences that end within the context: nothing of them would be left to score."""
+    """Refuse sequences that end within the context, since no step would be left to score."""
     for first, batch in split_batches(run.data, args.split, count, batch_size=500):
         length = batch.mask.sum(1)  # (B,)
         if (length <= args.context).any():
-            place = int(length.argmin())
+            row = int(length.argmin())
             raise ForbesError(
-                f"--context {args.context}: sequence {first + place} of the {args.split} split of {run.path} has "
-                f"{length[place]} steps, expected more. Choose a smaller context, or name other --scores"
+                f"--context {args.context}: sequence {first + row} of the {args.split} split of {run.path} has "
+                f"{length[row]} steps, expected more. Choose a smaller context, or name other --scores"
             )
 
 
 def _of(run: TrainedRun, jobs: Sequence[_Job]) -> list[_Job]:
-    """Leave out the scores that the run's model does not have."""
-    each = [job._replace(score=job.score.of(run.model)) for job in jobs]
-    return [job for job in each if job.score.metrics]
+    """Return the jobs of a run, without the scores that its model does not have."""
+    of_run = [job._replace(score=job.score.of(run.model)) for job in jobs]
+    return [job for job in of_run if job.score.metrics]
 
 
 def _count(run: TrainedRun, args: Any, default: int) -> int:
@@ -191,7 +208,7 @@ def _count(run: TrainedRun, args: Any, default: int) -> int:
 
 
 def _round_trip(run: TrainedRun, args: Any) -> dict[str, dict[str, Any]]:
-    """Measure, print and name how well its flows are inverted on the first batch of the split; {} of other families."""
+    """Measure and print the round-trip error of the flows on the first batch; return its entry, {} without flows."""
     _, batch = next(split_batches(run.data, args.split, _count(run, args, args.batch_size), args.batch_size))
     found = model_round_trip(run.model, batch, args.seed)
     print_round_trip(run.path, found)
@@ -206,16 +223,16 @@ def _round_trip(run: TrainedRun, args: Any) -> dict[str, dict[str, Any]]:
 
 
 def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
-    """Name a metric in full: `test[:1000]/pll[bernoulli,K=128]`."""
+    """Return the full name of a metric, e.g. `test[:1000]/pll[bernoulli,K=128]`."""
     whole = job.sequences == run.data.source.size(split)  # type: ignore[arg-type]  # argparse has checked it
     part = "" if whole else f"[:{job.sequences}]"
     tag = job.score.tag if job.name == "exact" else f"{run.model.likelihood.name},{job.score.tag}"
     return f"{split}{part}/{metric}[{tag}]"
 
 
-def _measure(one: EvaluatedRun, job: _Job, sha256: str, args: Any, folder: Path) -> PartialScores:
-    """Make a pass for a run and add what it finds; give the parts it has left, to be removed in the end."""
-    run, score = one.run, job.score
+def _measure(evaluated: EvaluatedRun, job: _Job, sha256: str, args: Any, folder: Path) -> PartialScores:
+    """Score a run and add the results to it. Return the saved partial scores, which are to be removed at the end."""
+    run, score = evaluated.run, job.score
     parts = PartialScores(
         folder / "evaluation-parts", run.checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed
     )
@@ -225,8 +242,8 @@ def _measure(one: EvaluatedRun, job: _Job, sha256: str, args: Any, folder: Path)
     scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts)
     for metric in score.metrics:
         name = _metric_name(run, job, metric, args.split)
-        one.totals[name] = scores.total(metric)
-        one.entries[name] = describe(scores, metric) | {
+        evaluated.totals[name] = scores.total(metric)
+        evaluated.entries[name] = describe(scores, metric) | {
             "data": {"name": data_name(run.data), "sha256": sha256},
             "checkpoint": run.checkpoint,
             "device": str(next(run.model.parameters()).device),

@@ -1,13 +1,12 @@
-"""What `forbes evaluate` prints of agents."""
+"""The tables that `forbes evaluate` prints for agents."""
 
 import itertools
-import sys
 from collections.abc import Sequence
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from forbes.commands.console import console
 from forbes.evaluation.agents import DISTANCES, REWARD, PlayedAgent
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.reward_prediction import STEPS_AHEAD
@@ -16,8 +15,8 @@ __all__ = ["print_agents"]
 
 
 def print_agents(played: Sequence[PlayedAgent]) -> None:
-    """Print the returns, the reward predictions, the beliefs, and the difference of each two agents."""
-    console = Console(width=None if sys.stdout.isatty() else 160)
+    """Print the returns, the reward predictions, the measures of the beliefs, and all paired differences."""
+    screen = console(160)
     episodes, how = len(played[0].returns), "undiscounted, mean ± standard error; the same episodes for all"
     table = Table(title=f"return in {episodes} episodes, by the mean action of K trajectories of the belief: {how}")
     for header in ("run", "agent", "parameters", "K", "return", "lowest", "highest"):
@@ -28,28 +27,29 @@ def print_agents(played: Sequence[PlayedAgent]) -> None:
         kind = f"{type(one.agent).__name__}, {type(one.agent.model.posterior).__name__}"
         samples = str(one.agent.acting_samples)
         table.add_row(escape(one.run), kind, f"{size:,}", samples, str(Estimate.of(one.returns)), *ends)
-    console.print(table)
-    console.print(_foresight(played))
+    screen.print(table)
+    screen.print(_reward_prediction(played))
     if any(one.belief for one in played):
-        console.print(_beliefs(played))
+        screen.print(_beliefs(played))
     for first, second in itertools.combinations(played, 2):
         difference = Estimate.of(first.returns - second.returns)
-        console.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
+        screen.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
 
 
-def _foresight(played: Sequence[PlayedAgent]) -> Table:
-    title = "share of the rewards' variance in these episodes that the world model foretells, by the actions taken"
-    table = Table("run", title=f"{title}; 0 is as good as the mean reward")
-    for distance in STEPS_AHEAD:
-        table.add_column(f"{distance} steps ahead" if distance else "when seen", justify="right")
+def _reward_prediction(played: Sequence[PlayedAgent]) -> Table:
+    title = "R² of the rewards in these episodes, predicted by the world model for the actions taken"
+    table = Table("run", title=f"{title}; 0 is no better than the mean reward")
+    for ahead in STEPS_AHEAD:
+        table.add_column(f"{ahead} steps ahead" if ahead else "current step", justify="right")
     for one in played:
-        table.add_row(escape(one.run), *("n/a" if share is None else str(share) for share in one.explained))
+        r2_scores = (one.r2[ahead] for ahead in STEPS_AHEAD)
+        table.add_row(escape(one.run), *("n/a" if r2 is None else str(r2) for r2 in r2_scores))
     return table
 
 
 def _beliefs(played: Sequence[PlayedAgent]) -> Table:
-    table = Table("run", title="the belief: its KL from the nearest Gaussian; how unsure it is of a reward it has met")
-    for column in ("prior, nats a step", "posterior, nats a step", "variance of the reward / exact belief's"):
+    table = Table("run", title="belief: KL from the nearest Gaussian, and variance of the reward it has just observed")
+    for column in ("prior, nats per step", "posterior, nats per step", "variance of the reward / exact belief's"):
         table.add_column(column, justify="right")
     for one in played:
         *distances, reward = (one.belief.get(metric) for metric in (*DISTANCES, REWARD))

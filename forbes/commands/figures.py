@@ -1,4 +1,4 @@
-"""`forbes figures`: the paper's figures from run folders."""
+"""`forbes figures`: draw the paper's figures from run folders."""
 
 import argparse
 import re
@@ -18,13 +18,11 @@ from forbes.evaluation.record import read_record
 from forbes.evaluation.references import reference_means
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
 from forbes.figures.returns import returns_against_env_steps
-from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates, predictions
-from forbes.figures.style import PALETTE, save_figure
+from forbes.figures.strokes import FamilyCurves, ambiguous_digits, elbo_against_updates, predictions
+from forbes.figures.style import PALETTE, save_png_and_pdf
 from forbes.runs.folder import RunFolder, read_config, read_metrics
 
 __all__ = ["main"]
-
-_FORMATS = (".png", ".pdf")
 
 
 def main(argv: Sequence[str]) -> None:
@@ -59,32 +57,34 @@ def _strokes(args: argparse.Namespace) -> None:
 
 
 def _agents(runs: Sequence[str]) -> tuple[str, dict[str, list[pd.Series]]]:
-    """Return the task of agents, and by name the curves of their returns, one for each seed."""
+    """Return the task of the agents, and the curves of their returns, one per seed, by name."""
     curves: dict[str, list[pd.Series]] = {}
     tasks = set()
     for run in runs:
         metrics = read_metrics(run)
         if not {"env_steps", "return/acting"} <= {*metrics}:
-            raise ForbesError(f"{run}: metrics.jsonl has no return/acting. Name runs of agents that were measured")
+            raise ForbesError(f"{run}: metrics.jsonl has no return/acting. Name runs of agents with measured returns")
         tasks.add(_task(RunFolder(run).config))
         name = re.sub(r"-\d+$", "", Path(run).absolute().name)
         measured = metrics[["env_steps", "return/acting"]].dropna()
         curves.setdefault(name, []).append(measured.set_index("env_steps")["return/acting"])
     if len(tasks) > 1:
-        raise ForbesError(f"--runs: they are of {' and '.join(sorted(tasks))}, expected one task. Draw each by itself")
+        raise ForbesError(
+            f"--runs: the tasks are {' and '.join(sorted(tasks))}, expected one task. Draw each task separately"
+        )
     return tasks.pop(), curves
 
 
 def _task(path: Path) -> str:
-    """Return the task of an agent's data, as its configuration says it."""
+    """Return the task in an agent's configuration."""
     try:
         return str(read_config(path)["data"]["init_args"]["source"]["init_args"]["task"])
     except (KeyError, TypeError) as error:
         raise ForbesError(f"{path}: its data have no task, expected Experience. Name runs of agents") from error
 
 
-def group(runs: Sequence[TrainedRun]) -> list[Family]:
-    """Make a family of runs whose configurations differ in the seed only."""
+def group(runs: Sequence[TrainedRun]) -> list[FamilyCurves]:
+    """Group runs into families, whose configurations differ only in the seed."""
     members: list[list[TrainedRun]] = []
     for run in runs:
         same = next((others for others in members if others[0].config == run.config), None)
@@ -96,12 +96,12 @@ def group(runs: Sequence[TrainedRun]) -> list[Family]:
     titles = run_titles([first for first, *_ in members])
     for runs_of_one, title, colour in zip(members, titles, cycle(PALETTE), strict=False):
         tests = [value for run in runs_of_one if (value := _test_elbo(run)) is not None]
-        families.append(Family(title, colour, runs_of_one[0].model, [_curve(run) for run in runs_of_one], tests))
+        families.append(FamilyCurves(title, colour, runs_of_one[0].model, [_curve(run) for run in runs_of_one], tests))
     return families
 
 
 def _curve(run: TrainedRun) -> pd.Series:
-    """Return the bound of the validation split against updates."""
+    """Return the bound on the validation split, indexed by update."""
     metrics = read_metrics(run.path)
     name = f"val/{run.model.bound_name}"
     if name not in metrics:
@@ -110,11 +110,13 @@ def _curve(run: TrainedRun) -> pd.Series:
 
 
 def _test_elbo(run: TrainedRun) -> float | None:
-    """Return the ELBO that `forbes evaluate` found for this checkpoint on the whole test split, if that is drawn."""
+    """Return the recorded ELBO of this checkpoint on the whole test split; None if missing, or for other bounds."""
     if not run.model.bound_name.startswith("elbo["):
         return None
-    own = {name: each for name, each in read_record(run.path).items() if each.get("checkpoint") == run.checkpoint}
-    return next((entry["mean"] for name, entry in own.items() if name.startswith("test/elbo[")), None)
+    entries = {
+        name: entry for name, entry in read_record(run.path).items() if entry.get("checkpoint") == run.checkpoint
+    }
+    return next((entry["mean"] for name, entry in entries.items() if name.startswith("test/elbo[")), None)
 
 
 def _index(index: Sequence[int], size: int) -> torch.Tensor:
@@ -125,6 +127,4 @@ def _index(index: Sequence[int], size: int) -> torch.Tensor:
 
 
 def _save(figure: Figure, folder: Path, name: str) -> None:
-    for suffix in _FORMATS:
-        save_figure(figure, folder / f"{name}{suffix}")
-        print(folder / f"{name}{suffix}")
+    print(*save_png_and_pdf(figure, folder, name), sep="\n")

@@ -1,4 +1,4 @@
-"""The commands `forbes fit`, `validate`, `test` and `predict`: a configuration, run by Lightning's Trainer."""
+"""The commands `forbes fit`, `validate`, `test` and `predict`: run a configuration with Lightning's Trainer."""
 
 import argparse
 import itertools
@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jsonargparse import DefaultHelpFormatter
@@ -22,7 +22,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
-import forbes.callbacks  # so that configurations know them by their short names
+import forbes.callbacks  # registers their short names for configurations
 from forbes.callbacks.divergence import StopAtDivergence
 from forbes.commands.lower_rate import MOST, LowerRateError, at_half_the_rate
 from forbes.commands.parsers.fit import DESCRIPTION, run_options
@@ -54,12 +54,12 @@ sys.modules["forbes.training.callbacks"] = forbes.callbacks  # the configuration
 
 _LIMITS = ("max_epochs", "max_steps", "max_time", "limit_train_batches")
 
-_NOT_OURS = (  # warnings that say nothing true or useful here
-    ".*does not have many workers.*",  # a batch is gathered in less time than a worker needs to hand it over
-    ".*dataloader is not resumable.*",  # it goes on from the trainer's update
+_NOT_OURS = (  # warnings that do not apply here
+    ".*does not have many workers.*",  # gathering a batch takes less time than the transfer from a worker
+    ".*dataloader is not resumable.*",  # it resumes from the trainer's update
     ".*`IterableDataset` has `__len__` defined.*",  # there are no workers
-    ".*You requested to overfit but enabled .* dataloader shuffling.*",  # nor do they shuffle
-    ".*smaller than the logging interval.*",  # the interval counts updates, whatever number of them is an epoch
+    ".*You requested to overfit but enabled .* dataloader shuffling.*",  # the batches are not shuffled
+    ".*smaller than the logging interval.*",  # the interval counts updates, not epochs
     ".*treespec, LeafSpec.*",  # Lightning 2.6 calls torch 2.13 the old way
     "(?s).*JsonargparseDeprecationWarning",  # and jsonargparse 4.53
     "(?s).*instantiate_classes",
@@ -67,7 +67,7 @@ _NOT_OURS = (  # warnings that say nothing true or useful here
 
 
 def fit(arguments: Sequence[str]) -> int:
-    """Train a model and give the exit status."""
+    """Train a model and return the exit status."""
     lowered = 0
     while True:
         try:
@@ -76,29 +76,29 @@ def fit(arguments: Sequence[str]) -> int:
             if lowered == MOST:
                 raise
             lowered, arguments = lowered + 1, at_half_the_rate(error)
-            signal.signal(signal.SIGINT, signal.default_int_handler)  # of no training, until the next has begun
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # until the next training installs its own
 
 
 def validate(arguments: Sequence[str]) -> int:
-    """Run the validation loop and give the exit status."""
+    """Run the validation loop and return the exit status."""
     return _run("validate", arguments)
 
 
 def test(arguments: Sequence[str]) -> int:
-    """Run the test loop and give the exit status."""
+    """Run the test loop and return the exit status."""
     return _run("test", arguments)
 
 
 def predict(arguments: Sequence[str]) -> int:
-    """Run the prediction loop and give the exit status."""
+    """Run the prediction loop and return the exit status."""
     return _run("predict", arguments)
 
 
 def _run(command: str, arguments: Sequence[str]) -> int:
-    """Run a command and turn what the libraries say about a wrong configuration into one sentence."""
+    """Run a command; turn the libraries' errors about a wrong configuration into one sentence."""
     for name in ("lightning.fabric", "lightning.pytorch"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    for name in ("profilers.profiler", "callbacks.model_summary"):  # what they say has been asked for
+    for name in ("profilers.profiler", "callbacks.model_summary"):  # the user has requested their output
         logging.getLogger(f"lightning.pytorch.{name}").setLevel(logging.INFO)
     allow_modules()
     with ExitStack() as stack, warnings.catch_warnings():
@@ -116,8 +116,35 @@ def _run(command: str, arguments: Sequence[str]) -> int:
             raise
 
 
+class _FitOptions(NamedTuple):
+    """Options of `fit` that are not part of the configuration."""
+
+    experiment: str | None = None
+    """Name of the experiment."""
+    run_dir: str | None = None
+    """Path of the run folder."""
+    resumed: RunFolder | None = None
+    """Run folder to resume."""
+    on_divergence: str = "stop"
+    """What to do after a divergence: stop or lower-rate."""
+
+    @classmethod
+    def parse(cls, arguments: Sequence[str]) -> tuple["_FitOptions", list[str]]:
+        """Return the options, and the arguments of the configuration, after those of a resumed run."""
+        options, rest = run_options().parse_known_args(arguments)
+        for option in ("resume", "run_dir"):
+            if (folder := getattr(options, option)) and folder.endswith(".ckpt"):
+                raise ForbesError(f"--{option} {folder}: is a checkpoint, expected a run folder")
+        if not options.resume:
+            return cls(options.experiment, options.run_dir, None, options.on_divergence), rest
+        run = RunFolder.trained(options.resume)
+        older = changed_defaults(read_config(run.config))
+        flags = [part for key, value in older.items() for part in (f"--{key}", str(value))]
+        return cls(resumed=run, on_divergence=options.on_divergence), ["--config", str(run.config), *flags, *rest]
+
+
 class _Help(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter):
-    """Keeps the line breaks of the run folder's options."""
+    """Help formatter that keeps the line breaks of the run folder's options."""
 
 
 class _Experiment(LightningCLI):
@@ -125,24 +152,16 @@ class _Experiment(LightningCLI):
 
     Args:
         command: fit, validate, test or predict.
-        arguments: its options.
-        stack: closed when the command ends; it holds the lock of the run folder.
+        arguments: options of the command.
+        stack: exit stack that holds the lock of the run folder; closed when the command ends.
     """
 
     def __init__(self, command: str, arguments: Sequence[str], stack: ExitStack) -> None:
         self.command, self.arguments, self.stack = command, arguments, stack
-        options = run_options()
-        self.options, rest = options.parse_known_args(arguments if command == "fit" else [])
-        for option in ("resume", "run_dir"):
-            if (folder := getattr(self.options, option)) and folder.endswith(".ckpt"):
-                raise ForbesError(f"--{option} {folder}: is the name of a checkpoint, expected that of a run folder")
-        self.resumed = RunFolder.trained(self.options.resume) if self.options.resume else None
-        if command != "fit":
-            rest = list(arguments)
-        elif self.resumed:
-            older = changed_defaults(read_config(self.resumed.config))
-            flags = [part for key, value in older.items() for part in (f"--{key}", str(value))]
-            rest = ["--config", str(self.resumed.config), *flags, *rest]
+        self.stop: StopOnSignal | None = None
+        self.options, configuration = _FitOptions(), list(arguments)
+        if command == "fit":
+            self.options, configuration = _FitOptions.parse(arguments)
         super().__init__(
             model_class=LightningModule,
             datamodule_class=SequenceDataModule,
@@ -153,13 +172,13 @@ class _Experiment(LightningCLI):
                 "usage": f"forbes {self.command} --config FILE [--OPTION VALUE ...]",
                 "formatter_class": _Help,
                 "description": DESCRIPTION[self.command],
-                "epilog": options.format_help() if self.command == "fit" else None,
+                "epilog": run_options().format_help() if self.command == "fit" else None,
                 "exit_on_error": False,
                 "allow_abbrev": False,
             },
             subclass_mode_model=True,
             subclass_mode_data=True,
-            args=rest,
+            args=configuration,
             run=False,
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,
@@ -179,7 +198,7 @@ class _Experiment(LightningCLI):
             )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Parse; Lightning's own would warn that the process has arguments, too. A run knows its data from anywhere."""
+        """Parse the arguments, without Lightning's warning about `sys.argv`, and make paths of data absolute."""
         with building(self._where()):
             self.config = parser.parse_args(args)
         for section in ("model", "data", "trainer"):
@@ -189,17 +208,17 @@ class _Experiment(LightningCLI):
             data[key] = str(Path(path).absolute())
 
     def instantiate_classes(self) -> None:
-        """Build what the configuration names."""
+        """Instantiate the classes of the configuration."""
         with building(self._where()):
             super().instantiate_classes()
 
     def _where(self) -> str:
-        """Name the configuration."""
+        """Return the configuration files, for error messages."""
         files = [value for flag, value in itertools.pairwise(self.arguments) if flag in ("--config", "-c", "--resume")]
         return " and ".join(files) or "the configuration"
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """Build the trainer; for `fit` with a run folder and all that fills it."""
+        """Build the trainer. For `fit`, open the run folder and add the callbacks and loggers that write to it."""
         config = self.config_init["trainer"]
         require_usable(config, self.model, self.datamodule)
         callbacks, plugins = _as_list(config["callbacks"]), _as_list(config["plugins"])
@@ -207,7 +226,6 @@ class _Experiment(LightningCLI):
             callbacks.append(progress())
         if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
             plugins.append(AtomicCheckpointIO())
-        self.stop: StopOnSignal | None = None
         if self.command != "fit" or config["fast_dev_run"]:
             self.save_config_callback = None
             given = {"logger": False, "enable_checkpointing": False}
@@ -216,7 +234,7 @@ class _Experiment(LightningCLI):
         return super().instantiate_trainer(**given, callbacks=callbacks, plugins=plugins, **kwargs)
 
     def _run_arguments(self, config: Any, callbacks: list[Any]) -> dict[str, Any]:
-        """Open the run folder, add the callbacks that fill it, and give the trainer's arguments that name it."""
+        """Open the run folder, add the callbacks that write to it, and return the trainer's arguments that name it."""
         run = self._open_run()
         print(f"run folder: {run}", flush=True)
         self.stop = StopOnSignal(run)
@@ -231,25 +249,25 @@ class _Experiment(LightningCLI):
         return {"logger": loggers, "default_root_dir": config["default_root_dir"] or run.path}
 
     def _open_run(self) -> RunFolder:
-        """Make the run folder, or take the one that was named, and keep other processes out."""
+        """Create the run folder, or use the one that was named, and lock it."""
         options = self.options
-        if self.resumed:
-            run = self.resumed
+        if options.resumed:
+            run = options.resumed
         elif options.run_dir:
             run = RunFolder(options.run_dir)
         else:
             experiment = options.experiment or experiment_name([str(path) for path in self.config["config"] or []])
             run = RunFolder.new(experiment, time.strftime("%Y%m%d-%H%M%S"), self.config["seed_everything"])
         self.stack.enter_context(run.locked())
-        if not self.resumed and run.checkpoint.exists():
-            raise ForbesError(f"{run}: holds a trained run. Name another, or go on with it: forbes fit --resume {run}")
+        if not options.resumed and run.checkpoint.exists():
+            raise ForbesError(f"{run}: holds a trained run. Name another, or resume it: forbes fit --resume {run}")
         if run.provenance.is_file():
-            read_provenance(run.provenance)  # a broken one is said before the training begins
+            read_provenance(run.provenance)  # reports a damaged file before the training begins
         return run
 
     def execute(self) -> int:
-        """Run the command and give its exit status."""
-        checkpoint = self.resumed.checkpoint if self.resumed else self.config.get("ckpt_path")
+        """Run the command and return its exit status."""
+        checkpoint = self.options.resumed.checkpoint if self.options.resumed else self.config.get("ckpt_path")
         updates = 0
         if checkpoint:
             content = read_checkpoint(Path(checkpoint))
@@ -257,7 +275,7 @@ class _Experiment(LightningCLI):
             updates = content["global_step"]
         how = {"datamodule": self.datamodule, "ckpt_path": checkpoint, "weights_only": True}
         if self.command in ("validate", "test"):
-            how["verbose"] = False  # Lightning's table would leave out what is in brackets
+            how["verbose"] = False  # Lightning's table would drop text in brackets
         try:
             found = getattr(self.trainer, self.command)(self.model, **how)
         except DivergedError as error:
@@ -267,35 +285,37 @@ class _Experiment(LightningCLI):
         except SIGTERMException:
             if self.stop is None:
                 return 128 + signal.SIGTERM
-            print(f"stopped at update {self.trainer.global_step}, go on with: forbes fit --resume {self.stop.run}")
+            print(f"stopped at update {self.trainer.global_step}, resume with: forbes fit --resume {self.stop.run}")
             return self.stop.exit_status
         if self.command == "predict":
             _print_predictions(found)
         elif self.command != "fit":
             _print_metrics(found)
         elif self.trainer.global_step == updates:
-            print(f"nothing was trained: {self._limits()} ends it at update {updates}. Give a higher limit to train on")
+            print(f"nothing was trained: {self._limits()} ends at update {updates}. Set a higher limit to continue")
         return 0
 
     def _limits(self) -> str:
-        """Name what may end the training before it begins, as the configuration says it."""
+        """Return the limits in the configuration that may end the training before it begins."""
         trainer = self.config["trainer"]
         names = [name for name in _LIMITS if trainer[name] not in (None, -1)]
         return ", ".join(f"{name} {trainer[name]}" for name in names)
 
 
 def _print_metrics(found: Sequence[Mapping[str, float]]) -> None:
-    """Print one metric a line."""
+    """Print one metric per line."""
     for name, value in itertools.chain.from_iterable(metrics.items() for metrics in found):
         print(f"{name}  {value}")
 
 
 def _print_predictions(found: Sequence[Tensor]) -> None:
-    """Print one sequence a line, its numbers `(B,)` or `(B, T)` apart by tabs."""
+    """Print one line per sequence of `(B,)` or `(B, T)`, with tabs between the values."""
     for values in torch.cat(list(found)).tolist():
         print(*(values if isinstance(values, list) else [values]), sep="\t")
 
 
 def _as_list(value: Any) -> list[Any]:
-    """Return what a configuration holds as one thing, several, or none."""
-    return [] if value is None else list(value) if isinstance(value, list) else [value]
+    """Return a configuration's value, which may be a list, a single item or None, as a new list."""
+    if value is None:
+        return []
+    return list(value) if isinstance(value, list) else [value]

@@ -1,4 +1,4 @@
-"""Commands side by side: each a process of its own, with its share of the processor's threads."""
+"""Run commands in parallel, each in its own process with an equal share of the CPU threads."""
 
 import os
 import signal
@@ -28,9 +28,9 @@ class Job(NamedTuple):
 def run_jobs(jobs: Sequence[Job], at_once: int) -> dict[str, int]:
     """Run every command, `at_once` at a time, and return the exit statuses by name.
 
-    On a terminal each running job has a line, the last that it printed; elsewhere all lines are printed, each after the
-    name of its job. A job that fails does not stop the others. Ctrl-C and SIGTERM are handed on as one SIGTERM to each
-    running job, which is waited for; those that have not begun never do.
+    A terminal shows the last line of each running job; elsewhere all lines are printed, prefixed with the job's name. A
+    job that fails does not stop the others. On Ctrl-C or SIGTERM, each running job gets one SIGTERM and is waited for,
+    and no further job is started.
     """
     board = _Board()
     with _sigterm_raises(), board.shown(), ThreadPoolExecutor(at_once) as pool:
@@ -40,7 +40,7 @@ def run_jobs(jobs: Sequence[Job], at_once: int) -> dict[str, int]:
             return {name: status.result() for name, status in found}
         except BaseException:
             running.stop()
-            raise  # when the pool has seen the end of what was running
+            raise  # after the pool has waited for the running jobs
 
 
 class _Board:
@@ -51,19 +51,19 @@ class _Board:
         self._lock = threading.Lock()
 
     def shown(self) -> AbstractContextManager[object]:
-        """Keep the lines on the terminal, if there is one."""
+        """Return a context that shows the lines on the terminal, if there is one."""
         self._live = Live(get_renderable=self._render, refresh_per_second=2) if sys.stdout.isatty() else None
         return self._live or nullcontext()
 
     def say(self, name: str, line: str) -> None:
-        """Take a line of a job."""
+        """Show a line of a job."""
         with self._lock:
             self._lines[name] = line
             if self._live is None:
                 print(f"{name}: {line}", flush=True)
 
     def end(self, name: str, status: int) -> None:
-        """Print how a job has ended, and its last line."""
+        """Print the exit status of a job, and its last line."""
         with self._lock:
             last = self._lines.pop(name, "")
             text = f"{name}: {'done' if status == 0 else f'ended with status {status}'}. {last}"
@@ -98,7 +98,7 @@ class _Running:
                 text=True,
                 errors="replace",
                 env=self.environment,
-                start_new_session=True,  # Ctrl-C reaches this process alone, so that each job gets one signal
+                start_new_session=True,  # Ctrl-C reaches only this process, so that each job gets one signal
             )
             self.processes.append(process)
         with process:
@@ -110,7 +110,7 @@ class _Running:
         return process.returncode
 
     def stop(self) -> None:
-        """Send every running job one SIGTERM, and begin no other."""
+        """Send SIGTERM to every running job, and start no further job."""
         with self.lock:
             self.stopping = True
             for process in self.processes:
@@ -120,7 +120,7 @@ class _Running:
 
 @contextmanager
 def _sigterm_raises() -> Iterator[None]:
-    """Turn SIGTERM into an exception of the main thread, which alone may set handlers."""
+    """Turn SIGTERM into an exception in the main thread, the only one that may set handlers."""
     before = signal.signal(signal.SIGTERM, _exit)
     try:
         yield

@@ -1,4 +1,4 @@
-"""What `forbes fit --on-divergence lower-rate` does: go back one checkpoint, and on from there at half the rate."""
+"""`forbes fit --on-divergence lower-rate`: go back to the last checkpoint and continue at half the learning rate."""
 
 import sys
 
@@ -10,15 +10,15 @@ from forbes.training.divergence import DivergedError
 __all__ = ["MOST", "LowerRateError", "at_half_the_rate"]
 
 MOST = 3
-"""Times that a command lowers the rate, before it stops."""
+"""Number of times that a command lowers the rate before it stops."""
 
 
 class LowerRateError(DivergedError):
-    """A training has diverged that is to go on at a lower rate.
+    """A training diverged and shall continue at a lower rate.
 
     Args:
-        error: why.
-        run: of the training.
+        error: divergence of the training.
+        run: run folder of the training.
     """
 
     def __init__(self, error: DivergedError, run: RunFolder) -> None:
@@ -27,11 +27,11 @@ class LowerRateError(DivergedError):
 
 
 def at_half_the_rate(error: LowerRateError) -> list[str]:
-    """Return the arguments of the `forbes fit` that goes on, and note the new rates in the metrics of the run.
+    """Return the arguments of the `forbes fit` that continues, and log the new rates to the metrics of the run.
 
-    All rates of the module, its arguments `..._rate`, are halved. Where there is no checkpoint yet, the training begins
-    again. The line in metrics.jsonl has the update that the training goes back to, `divergence/update`, the update that
-    was not finite as errors count them, from 1, and each rate as `divergence/NAME`.
+    All rates of the module (arguments named `..._rate`) are halved. Without a checkpoint the training starts over. The
+    step of the line in metrics.jsonl is the update that the training goes back to, `divergence/update` is the update
+    that was not finite (counted from 1), and `divergence/NAME` is the new value of each rate.
     """
     run = error.run
     before = read_config(run.config)["model"]["init_args"]
@@ -41,7 +41,7 @@ def at_half_the_rate(error: LowerRateError) -> list[str]:
         begin, update = ["--resume", str(run)], read_checkpoint(run.checkpoint)["global_step"]
     named = {f"divergence/{name}": rate for name, rate in rates.items()}
     JsonLinesLogger(run.metrics).log_metrics({"divergence/update": error.update, **named}, step=update - 1)
-    told = ", ".join(f"{name} {rate:g}" for name, rate in rates.items())
-    print(f"forbes: {error}\nforbes: goes on from update {update} with {told}", file=sys.stderr, flush=True)
+    new_rates = ", ".join(f"{name} {rate:g}" for name, rate in rates.items())
+    print(f"forbes: {error}\nforbes: continues from update {update} with {new_rates}", file=sys.stderr, flush=True)
     flags = [part for name, rate in rates.items() for part in (f"--model.{name}", str(rate))]
     return [*begin, *flags, "--on-divergence", "lower-rate"]

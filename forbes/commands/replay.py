@@ -1,4 +1,4 @@
-"""`forbes replay`: computes an update that was not finite again, and names the first tensor that is not."""
+"""`forbes replay`: recompute an update that was not finite, and name the first tensor that is not."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments.
 
     Raises:
-        ForbesError: where the file is not what a divergence leaves, or the update is finite now.
+        ForbesError: if the file is not the failure.pt of a divergence, or the update is finite now.
     """
     path = parser().parse_args(argv).failure
     if not path.is_file():
@@ -48,7 +48,7 @@ def main(argv: Sequence[str]) -> None:
         check_batch(data.source, SequenceBatch(**batch))
     device = failure["device"] if torch.cuda.is_available() else "cpu"
     found = first_not_finite(module, failure, device)
-    update = f"{path}: update {failure['update'] + 1}, computed again on {device}"
+    update = f"{path}: update {failure['update'] + 1}, recomputed on {device}"
     if found is None:
         raise ForbesError(
             f"{update}, is finite; it was not on {failure['device']}. Replay it there, with the version and the "
@@ -58,23 +58,22 @@ def main(argv: Sequence[str]) -> None:
 
 
 def first_not_finite(module: WorldModel | KnownBelief, failure: Mapping[str, Any], device: str = "cpu") -> str | None:
-    """Compute an update again and describe its first tensor that is not finite; None where all are.
+    """Recompute an update and describe its first tensor that is not finite; return None if all are finite.
 
     Args:
-        module: of the run's configuration; gets the weights before the update.
+        module: module built from the run's configuration. The weights before the update are loaded into it.
         failure: content of `failure.pt`.
-        device: to compute on.
+        device: device to compute on.
     """
     module.load_state_dict(failure["state_dict"])
     module.to(device).train()
     watch = _Watch(module)
     for number, content in zip(failure["batch_numbers"], failure["batches"], strict=True):
-        batch = SequenceBatch(**content)
-        for name, values in batch._asdict().items():
+        for name, values in content.items():
             watch.look(f"{name} of batch {number}", values)
-        batch = SequenceBatch(*(values.to(device) for values in batch))
+        batch = SequenceBatch(**content).to(device)
         _stand_before(module, failure["update"], number)
-        module.on_train_batch_start(batch, batch_idx=1)  # seeds the noise; 0 would check the data of an epoch
+        module.on_train_batch_start(batch, batch_idx=1)  # seeds the noise; index 0 would check the data of an epoch
         with torch.autocast(device, torch.bfloat16, enabled=failure["precision"].startswith("bf16")):
             loss, terms = module.total_loss(batch) if isinstance(module, WorldModel) else (module.loss(batch), {})
         for name, values in terms.items():
@@ -89,10 +88,10 @@ def first_not_finite(module: WorldModel | KnownBelief, failure: Mapping[str, Any
 
 
 class _Watch:
-    """Notes what is not finite, in the order in which an update computes it.
+    """Records tensors that are not finite, in the order in which an update computes them.
 
     Args:
-        module: whose parameters, outputs of modules within and gradients are looked at.
+        module: module whose parameters, submodule outputs and gradients are checked.
     """
 
     def __init__(self, module: LightningModule) -> None:
@@ -105,7 +104,7 @@ class _Watch:
             parameter.register_post_accumulate_grad_hook(partial(self._accumulated, name))
 
     def look(self, name: str, values: Any) -> None:
-        """Note the tensors in `values` that are not finite."""
+        """Record the tensors in `values` that are not finite."""
         for tensor in _tensors(values):
             if broken := int((~tensor.isfinite()).sum()):
                 self.found.append(f"{name}: {broken} of {tensor.numel()} values, shape {tuple(tensor.shape)}")
@@ -129,24 +128,24 @@ def _tensors(values: Any) -> Iterator[Tensor]:
 
 
 def _stand_before(module: LightningModule, update: int, batch: int) -> None:
-    """Let a module that no Trainer trains count updates and batches as it did."""
+    """Set the counters of updates and batches of a module without a Trainer."""
     vars(module)["_trainer"] = SimpleNamespace(global_step=update, fit_loop=SimpleNamespace(total_batch_idx=batch))
 
 
 def _problem_of(failure: Any) -> str:
-    """Say what is wrong with the content of a failure.pt; nothing where all is well."""
+    """Return what is wrong with the content of a failure.pt, or an empty string."""
     if not isinstance(failure, dict):
         return f"holds a {type(failure).__name__}"
     for name, kind in _FIELDS.items():
         if not isinstance(failure.get(name), kind):
             return f"its {name} is {type(failure.get(name)).__name__}"
     if not all(isinstance(value, Tensor) for value in failure["state_dict"].values()):
-        return "its state_dict holds what is no tensor"
+        return "its state_dict has values that are not tensors"
     for batch in failure["batches"]:
         if not isinstance(batch, dict) or {*batch} != {*SequenceBatch._fields}:
             return "one of its batches lacks a field"
         if not all(isinstance(value, Tensor) for value in batch.values()):
-            return "one of its batches holds what is no tensor"
+            return "one of its batches has values that are not tensors"
     if len(failure["batch_numbers"]) != len(failure["batches"]):
-        return "it has not a number for each batch"
+        return "it does not have one number per batch"
     return ""

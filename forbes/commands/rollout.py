@@ -1,4 +1,4 @@
-"""`forbes rollout`: an agent plays, and is filmed."""
+"""`forbes rollout`: record episodes of an agent as a GIF."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ def main(argv: Sequence[str]) -> None:
         )
     frames = []
     with loaded_agent(args.run, find_device(args.device), args.acting_samples) as (agent, environment, _):
-        remedy = f"Train on pixels; the return is told by: forbes evaluate {args.run}"
+        remedy = f"Train on pixels; for the return alone, run: forbes evaluate {args.run}"
         require_images(args.run, environment.observation_shape, remedy)
         for number in range(args.episodes):
             episode = play_test_episode(agent, environment, args.seed, number)

@@ -1,8 +1,7 @@
-"""The tables that `forbes evaluate` prints: a row for each score, a column for each run, as wide as the terminal."""
+"""The tables of `forbes evaluate`: one row per score, one column per run, at most as wide as the terminal."""
 
 import itertools
 import math
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,52 +9,54 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from forbes.commands.console import console
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.metrics import EvaluatedRun, Pair, at_horizons, degradation
 from forbes.evaluation.references import lowest_above
 
 __all__ = ["beaten_by", "print_degradation", "print_pairs", "print_references", "print_runs"]
 
-_PIPE = 200
-"""Columns where there is no terminal: rich would take 80."""
-
 
 def print_runs(measured: Sequence[EvaluatedRun]) -> None:
-    """Print every metric of every run; n/a where its model does not have it."""
-    console = _console()
-    for number, one in enumerate(measured, start=1):
-        text = f"{number}  {escape(one.run.path)}: {one.run.family}, {one.run.parameters:,} parameters"
-        console.print(text, soft_wrap=True)
+    """Print every metric of every run; n/a if its model does not have it."""
+    screen = console(200)
+    for number, evaluated in enumerate(measured, start=1):
+        text = (
+            f"{number}  {escape(evaluated.run.path)}: {evaluated.run.family}, {evaluated.run.parameters:,} parameters"
+        )
+        screen.print(text, soft_wrap=True)
     columns = {
-        str(number): {name: _cell(name, entry) for name, entry in one.entries.items()}
-        for number, one in enumerate(measured, start=1)
+        str(number): {name: _cell(name, entry) for name, entry in evaluated.entries.items()}
+        for number, evaluated in enumerate(measured, start=1)
     }
-    _print(console, "nats per sequence, mean ± standard error; ess as a share of K", columns)
+    _print(screen, "nats per sequence, mean ± standard error; ess as a fraction of K", columns)
 
 
 def print_references(measured: Sequence[EvaluatedRun]) -> None:
-    """Print what the references score on the same sequences, and explain the marks of `print_runs`."""
+    """Print the scores of the references on the same sequences, and explain the marks of `print_runs`."""
     columns: dict[str, dict[str, str]] = {}
-    for name, entry in itertools.chain.from_iterable(one.entries.items() for one in measured):
+    for name, entry in itertools.chain.from_iterable(evaluated.entries.items() for evaluated in measured):
         for reference, estimate in entry.get("references", {}).items():
             columns.setdefault(reference, {})[name] = str(_estimate(estimate))
     if not columns:
         return
-    console = _console()
-    _print(console, "log p of the same steps by models without a belief, nats per sequence", columns)
-    below = [one.run.path for one in measured if any(beaten_by(entry) for entry in one.entries.values())]
+    screen = console(200)
+    _print(screen, "log p of the same steps under models without a belief, nats per sequence", columns)
+    below = [
+        evaluated.run.path for evaluated in measured if any(beaten_by(entry) for entry in evaluated.entries.values())
+    ]
     if below:
-        text = f"<: below this reference, so less was learned than it knows: {escape(', '.join(below))}"
-        console.print(text, soft_wrap=True)
+        text = f"<: below this reference, so the model has learned less than it: {escape(', '.join(below))}"
+        screen.print(text, soft_wrap=True)
 
 
 def beaten_by(entry: Mapping[str, Any]) -> str | None:
-    """Return the lowest reference above an entry of `evaluation.json`; None where it is above all or has none."""
+    """Return the lowest reference above an entry of `evaluation.json`, or None if there is none above it."""
     return lowest_above(entry["mean"], {name: each["mean"] for name, each in entry.get("references", {}).items()})
 
 
 def print_pairs(pairs: Sequence[Pair]) -> None:
-    """Print the paired difference of every metric of which more is better; n/a where a model does not have it."""
+    """Print the paired difference of every metric in `SCORES`; n/a if a model does not have it."""
     runs = list(dict.fromkeys(run.run.path for pair in pairs for run in pair[:2]))
     columns = {
         f"{runs.index(first.run.path) + 1} − {runs.index(second.run.path) + 1}": {
@@ -63,34 +64,34 @@ def print_pairs(pairs: Sequence[Pair]) -> None:
         }
         for first, second, differences in pairs
     }
-    _print(_console(), "paired differences over the same sequences, nats per sequence (in standard errors)", columns)
+    _print(console(200), "paired differences over the same sequences, nats per sequence (in standard errors)", columns)
 
 
 def print_degradation(measured: Sequence[EvaluatedRun]) -> None:
-    """Print what the open loop loses to the closed one, for every run that has both scores."""
+    """Print the degradation of every run that has both the closed-loop and the open-loop score."""
     curves: dict[str, dict[str, list[float]]] = {}
-    for one in measured:
-        for name, entry in one.entries.items():
-            curves.setdefault(name, {})[one.run.path] = entry["curve"]
+    for evaluated in measured:
+        for name, entry in evaluated.entries.items():
+            curves.setdefault(name, {})[evaluated.run.path] = entry["curve"]
     for metric, of_runs in degradation(curves).items():
         rows = at_horizons(metric, of_runs)
-        numbers = {one.run.path: str(number) for number, one in enumerate(measured, start=1)}
+        numbers = {evaluated.run.path: str(number) for number, evaluated in enumerate(measured, start=1)}
         columns = {
             numbers[path]: {f"{horizon} steps": f"{loss:.2f}" for horizon, loss in row.items()}
             for path, row in rows.items()
         }
-        _print(_console(), f"{metric}: nats a prediction loses so many steps after the last one seen", columns)
+        _print(console(200), f"{metric}: nats that a prediction loses, by steps after the last observation", columns)
 
 
-def _print(console: Console, title: str, columns: Mapping[str, Mapping[str, str]]) -> None:
-    """Print a table of named rows; where it is wider than the console, several of some columns each."""
+def _print(screen: Console, title: str, columns: Mapping[str, Mapping[str, str]]) -> None:
+    """Print a table with named rows; if it is wider than the console, split its columns into several tables."""
     names = [(name, _in_lines(name)) for name in _union(columns.values())]
-    room = console.width - max((len(line) for _, lines in names for line in lines.split("\n")), default=0) - 4
+    room = screen.width - max((len(line) for _, lines in names for line in lines.split("\n")), default=0) - 4
     widths = {
         header: max(len(line) for cell in (header, *cells.values()) for line in cell.split("\n")) + 3
         for header, cells in columns.items()
     }
-    console.print(f"\n{escape(title)}", soft_wrap=True)
+    screen.print(f"\n{escape(title)}", soft_wrap=True)
     for headers in _fitting(widths, room):
         table = Table()
         table.add_column("score", no_wrap=True)
@@ -98,11 +99,11 @@ def _print(console: Console, title: str, columns: Mapping[str, Mapping[str, str]
             table.add_column(escape(header), justify="right", no_wrap=True)
         for name, lines in names:
             table.add_row(escape(lines), *(escape(columns[header].get(name, "n/a")) for header in headers))
-        console.print(table)
+        screen.print(table)
 
 
 def _fitting(widths: Mapping[str, int], room: int) -> Iterator[list[str]]:
-    """Part columns into groups that have room, one at least in each."""
+    """Split columns into groups that fit into the room, with at least one column each."""
     group: list[str] = []
     for header, width in widths.items():
         if group and sum(widths[each] for each in group) + width > room:
@@ -113,19 +114,15 @@ def _fitting(widths: Mapping[str, int], room: int) -> Iterator[list[str]]:
         yield group
 
 
-def _console() -> Console:
-    return Console(width=None if sys.stdout.isatty() else _PIPE)
-
-
 def _in_lines(name: str) -> str:
-    """Break `test[:1000]/pll[categorical,K=128]` before the likelihood and the numbers."""
+    """Break a name such as `test[:1000]/pll[categorical,K=128]` into two lines before its tag."""
     split, slash, rest = name.partition("/")
     score, bracket, tag = rest.partition("[")
     return f"{split}{slash}{score}\n  {bracket}{tag}" if bracket else name
 
 
 def _union(tables: Iterable[Iterable[str]]) -> list[str]:
-    """Return every name once; those that some lack come where the longest table has them."""
+    """Return every name once, in the order of the longest table."""
     longest_first = sorted([list(names) for names in tables], key=len, reverse=True)
     return list(dict.fromkeys(itertools.chain.from_iterable(longest_first)))
 

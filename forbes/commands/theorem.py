@@ -1,18 +1,17 @@
 """`forbes theorem`: Theorem 1 on linear-Gaussian processes, and why a higher ELBO is not a better belief."""
 
 import argparse
-import sys
 from collections.abc import Callable, Mapping, Sequence
 
-from rich.console import Console
 from rich.table import Table
 
+from forbes.commands.console import console
 from forbes.commands.parsers.theorem import parser
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.theorem import (
+    ClosedFormProcess,
     Conditional,
-    LinearGaussian,
     belief_scores,
     between,
     elbo,
@@ -30,48 +29,50 @@ from forbes.seeding import generator
 __all__ = ["main"]
 
 _CASES = ((1.0, 1.0, 1.0), (1.0, 0.1, 1.0), (0.9, 0.3, 0.5))
-_POSTERIORS: Mapping[str, Callable[[LinearGaussian], Conditional]] = {
+_POSTERIORS: Mapping[str, Callable[[ClosedFormProcess], Conditional]] = {
     "exact p(s_t | o_1:t)": exact_filter,
     "exact p(s_t | s_t-1, o_t)": exact_one_step,
     "optimal q(s_t | o_1:t)": factorised_optimum,
     "optimal q(s_t | s_t-1, o_1:t)": structured_optimum,
 }
-_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-_NUMBERS = 30_000_000  # drawn for one row; they take 1 GB
+_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
+_MAX_SAMPLES = 30_000_000  # samples times steps; they take 1 GB
 
 _IDENTITY = """\
-log p - ELBO is the sum of the KLs to the smoothing conditionals p(s_t | s_t-1, o_t:T); with the filtering posterior
-p(s_t | o_1:t), as the paper has it, it is not. Monte Carlo averages log p(o) - log p(s, o) + log q(s | o)."""
+log p - ELBO equals the sum of the KLs to the smoothing conditionals p(s_t | s_t-1, o_t:T). It does not equal the sum
+for the filtering posterior p(s_t | o_1:t), as the paper has it. Monte Carlo is the mean of log p(o) - log p(s, o) +
+log q(s | o) over samples."""
 _BELIEFS = """\
-The exact filter p(s_t | o_1:t) predicts best (PLL) and covers what it says, yet its ELBO is lower than that of both
-optima: these claim less variance than there is, and cover less than their nominal 90 %."""
+The exact filter p(s_t | o_1:t) predicts best (PLL) and has its nominal coverage, yet its ELBO is lower than that of
+both optima. The optima have too small variances and cover less than their nominal 90 %."""
 _SCAN = """\
-On the way from the exact filter to the optimal q(s_t | o_1:t), the ELBO and the prequential score put the beliefs in
+Between the exact filter and the optimal q(s_t | o_1:t), the ELBO and the prequential score rank the beliefs in
 opposite orders."""
 
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
-    if args.samples * args.steps > _NUMBERS:
-        raise ForbesError(f"--samples {args.samples}: expected at most {_NUMBERS // args.steps} of {args.steps} steps")
+    if args.samples * args.steps > _MAX_SAMPLES:
+        most = _MAX_SAMPLES // args.steps
+        raise ForbesError(f"--samples {args.samples}: expected at most {most} with {args.steps} steps")
     processes = _processes(args)
-    console = Console(width=None if sys.stdout.isatty() else 160)  # into a file, rich would fold at 80
-    console.print(_identity(processes, args.samples, args.seed), _IDENTITY, "", sep="\n", highlight=False)
-    console.print(_beliefs(processes), _BELIEFS, "", sep="\n", highlight=False)
-    console.print(_scan(processes), _SCAN, sep="\n", highlight=False)
+    screen = console(160)
+    screen.print(_identity(processes, args.samples, args.seed), _IDENTITY, "", sep="\n", highlight=False)
+    screen.print(_beliefs(processes), _BELIEFS, "", sep="\n", highlight=False)
+    screen.print(_scan(processes), _SCAN, sep="\n", highlight=False)
 
 
-def _processes(args: argparse.Namespace) -> list[LinearGaussian]:
-    """Take the process that the arguments describe, or three where they describe none."""
+def _processes(args: argparse.Namespace) -> list[ClosedFormProcess]:
+    """Return the process given by the arguments, or three processes by default."""
     given = (args.transition, args.process_noise, args.observation_noise)
     if given == (None, None, None):
-        return [LinearGaussian(*case, args.steps) for case in _CASES]
+        return [ClosedFormProcess(*case, args.steps) for case in _CASES]
     transition, process_noise, observation_noise = (1.0 if value is None else value for value in given)
-    return [LinearGaussian(transition, process_noise, observation_noise, args.steps)]
+    return [ClosedFormProcess(transition, process_noise, observation_noise, args.steps)]
 
 
-def _name(process: LinearGaussian) -> str:
+def _name(process: ClosedFormProcess) -> str:
     return f"F={process.transition:g} Q={process.process_noise:g} R={process.observation_noise:g}"
 
 
@@ -82,8 +83,8 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def _identity(processes: Sequence[LinearGaussian], samples: int, seed: int) -> Table:
-    """Compare both sides of the identity, and the paper's form of it."""
+def _identity(processes: Sequence[ClosedFormProcess], samples: int, seed: int) -> Table:
+    """Return a table of both sides of the identity, and of the paper's form of it."""
     table = _table(
         f"Theorem 1 in nats per sequence, {processes[0].steps} steps, {samples} samples", "posterior", "log p - ELBO",
         "Σ KL, smoothing", "difference", "Monte Carlo", "paper: Σ KL, filter", "its error",
@@ -96,8 +97,8 @@ def _identity(processes: Sequence[LinearGaussian], samples: int, seed: int) -> T
             right, paper = (expected_kl(posterior, target, moment).item() for target in (smoother, exact))
             if not abs(gap - right) <= 1e-8 * max(1.0, gap):
                 raise ForbesError(
-                    f"{_name(process)}: with {process.steps} steps the numbers leave the precision of float64. "
-                    "Choose fewer --steps, or F and the ratio of Q and R nearer to 1"
+                    f"{_name(process)}: with {process.steps} steps the precision of float64 does not suffice. "
+                    "Choose fewer --steps, or F and the ratio of Q and R closer to 1"
                 )
             drawn = Estimate.of(sample_gap(process, posterior, samples, generator(seed, "theorem", number)))
             table.add_row(
@@ -108,10 +109,10 @@ def _identity(processes: Sequence[LinearGaussian], samples: int, seed: int) -> T
     return table
 
 
-def _beliefs(processes: Sequence[LinearGaussian]) -> Table:
-    """Score each posterior by its ELBO, and as a belief."""
+def _beliefs(processes: Sequence[ClosedFormProcess]) -> Table:
+    """Return a table of the scores of each posterior by its ELBO, and as a belief."""
     table = _table(
-        "What the same posteriors are worth as beliefs q(s_t | o_1:t)", "belief", "log p - ELBO", "log p - PLL",
+        "Scores of the same posteriors as beliefs q(s_t | o_1:t)", "belief", "log p - ELBO", "log p - PLL",
         "Σ KL, to the exact", "state NLL per step", "variance ratio", "coverage",
     )  # fmt: skip
     for process in processes:
@@ -125,22 +126,22 @@ def _beliefs(processes: Sequence[LinearGaussian]) -> Table:
     return table
 
 
-def _scan(processes: Sequence[LinearGaussian]) -> Table:
-    """Rank beliefs on the way from the exact filter to the factorised optimum by ELBO and by prediction."""
+def _scan(processes: Sequence[ClosedFormProcess]) -> Table:
+    """Return a table that ranks beliefs between the exact filter and the factorised optimum by ELBO and by PLL."""
     table = _table(
-        "Which belief is better?", "share of the way", "log p - ELBO", "rank by ELBO", "log p - PLL", "rank by PLL"
+        "Which belief is better?", "interpolation", "log p - ELBO", "rank by ELBO", "log p - PLL", "rank by PLL"
     )
     for process in processes:
         ends = exact_filter(process), factorised_optimum(process)
-        scores = [belief_scores(process, between(*ends, share)) for share in _SHARES]
+        scores = [belief_scores(process, between(*ends, fraction)) for fraction in _FRACTIONS]
         gaps, deficits = [score.elbo_gap for score in scores], [score.prequential_deficit for score in scores]
-        for share, gap, deficit in zip(_SHARES, gaps, deficits, strict=True):
+        for fraction, gap, deficit in zip(_FRACTIONS, gaps, deficits, strict=True):
             by_elbo, by_prediction = _rank(gap, gaps), _rank(deficit, deficits)
-            table.add_row(_name(process), f"{share:.0%}", f"{gap:.3f}", by_elbo, f"{deficit:.4f}", by_prediction)
+            table.add_row(_name(process), f"{fraction:.0%}", f"{gap:.3f}", by_elbo, f"{deficit:.4f}", by_prediction)
         table.add_section()
     return table
 
 
-def _rank(own: float, values: Sequence[float]) -> str:
-    """Say how many values are smaller, counted from 1; the last digits of float64 make no difference."""
-    return str(1 + sum(other < own - 1e-9 for other in values))
+def _rank(value: float, values: Sequence[float]) -> str:
+    """Return the rank of a value, from 1; differences below 1e-9 are ties."""
+    return str(1 + sum(other < value - 1e-9 for other in values))

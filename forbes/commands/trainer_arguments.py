@@ -1,4 +1,4 @@
-"""Arguments of Lightning's Trainer that are refused: here they would do nothing, or something else than they say."""
+"""Refuse arguments of Lightning's Trainer that would have no effect here, or another effect than documented."""
 
 import re
 from collections.abc import Callable
@@ -16,7 +16,7 @@ __all__ = ["require_usable"]
 
 
 class _Rule(NamedTuple):
-    """What is accepted of an argument, in code and in words."""
+    """Accepted values of an argument, as a function and in words."""
 
     argument: str
     accepts: Callable[[Any], bool]
@@ -24,7 +24,7 @@ class _Rule(NamedTuple):
 
 
 def _one_device(devices: Any) -> bool:
-    """Tell whether these are one device on every machine: a number, or one index as `3,` or `[3]`."""
+    """Return whether this is one device on every machine: the number 1, or one index as `3,` or `[3]`."""
     return re.fullmatch(r"1|\d+,|\[\d+\]", str(devices)) is not None
 
 
@@ -62,20 +62,20 @@ _OF_A_WORLD_MODEL = (
 _OF_AN_AGENT = (
     _Rule("max_steps", lambda steps: steps == -1, f"-1. {_WHOLE_EPOCHS}"),
     _Rule("max_time", lambda duration: duration is None, f"null. {_WHOLE_EPOCHS}"),
-    _Rule("overfit_batches", lambda share: not share, "0. The episodes that an agent draws from grow in number"),
+    _Rule("overfit_batches", lambda share: not share, "0. The replay of an agent grows during training"),
 )
 
 
 def require_usable(trainer: Namespace, model: LightningModule, data: SequenceDataModule) -> None:
-    """Refuse arguments of the Trainer that would not do what they say.
+    """Refuse arguments of the Trainer that would not have their documented effect.
 
     Args:
         trainer: section `trainer` of the configuration, with its classes instantiated.
-        model: what is trained.
-        data: what it is trained on.
+        model: module to train.
+        data: data module.
 
     Raises:
-        ForbesError: for the first argument that is refused.
+        ForbesError: for the first refused argument.
     """
     rules = list(_ALWAYS)
     rules += _OF_A_WORLD_MODEL if isinstance(model, WorldModel) else ()

@@ -1,4 +1,4 @@
-"""Data: one DataModule, several sources of sequences."""
+"""Data: one DataModule for sequences from several kinds of sources."""
 
 from forbes.data.datamodule import SequenceDataModule
 from forbes.data.episodes.experience import Experience

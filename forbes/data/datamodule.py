@@ -1,4 +1,4 @@
-"""The DataModule: batches of sequences from any source, each a pure function of (seed, update)."""
+"""The DataModule: batches of sequences from any source. A batch is a pure function of (seed, update)."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch, check_source
 from forbes.errors import require_at_least
 
-__all__ = ["SequenceDataModule"]
+__all__ = ["SequenceDataModule", "datamodule_of"]
 
 
 class _Batches(IterableDataset[Any]):
@@ -21,7 +21,7 @@ class _Batches(IterableDataset[Any]):
         self.source, self.split, self.length, self.indices = source, split, length, indices
 
     def __iter__(self) -> Iterator[Any]:
-        for index in self.indices:  # lazily: when the iterator is made, the trainer may not know its update yet
+        for index in self.indices:  # lazily: the trainer may not know its update yet when the iterator is created
             yield self.source.gather(self.split, index, self.length)
 
     def __len__(self) -> int:
@@ -29,7 +29,7 @@ class _Batches(IterableDataset[Any]):
 
 
 class _TrainIndices:
-    """Indices of an epoch's batches, chosen by the source: those after the ones that the trainer has taken."""
+    """Indices of the batches of an epoch, chosen by the source, starting after the batches already trained on."""
 
     def __init__(self, datamodule: "SequenceDataModule") -> None:
         self.datamodule = datamodule
@@ -44,27 +44,33 @@ class _TrainIndices:
 
 
 def _batches_taken(trainer: Trainer) -> int:
-    """Count the training batches so far; with `overfit_batches` those of this epoch, since all epochs share theirs."""
+    """Return the number of training batches so far; with `overfit_batches`, those of this epoch only."""
     loop, same = trainer.fit_loop, trainer.overfit_batches  # type: ignore[attr-defined]  # set by a helper of Lightning
     return 1 + (loop.batch_idx if same else loop.total_batch_idx)
+
+
+def datamodule_of(trainer: Trainer) -> "SequenceDataModule":
+    """Return the data module of a trainer, an attribute that Lightning does not declare."""
+    data: SequenceDataModule = trainer.datamodule  # type: ignore[attr-defined]
+    return data
 
 
 class SequenceDataModule(LightningDataModule):
     """Batches of `SequenceBatch` from a source; images stay uint8 until they are on the device.
 
-    Batch i of the training is a pure function of (seed, i): a resumed run goes on with the batch it would have had,
-    and no loader or RNG state is stored. An epoch is a number of updates, not a pass over the data.
+    Training batch i is a pure function of (seed, i). A resumed run continues with the batch it would have had, and no
+    loader or RNG state is stored. An epoch is a number of updates, not a pass over the data.
 
     Args:
-        source: where the sequences come from, e.g. `Strokes`.
-        batch_size: B.
-        length: T; sequences are cut or padded to it.
-        updates_per_epoch: batches between two validations and checkpoints.
-        seed: of the order of the training batches.
-        validation_sequences: how many of the validation split are used after each epoch, from its beginning.
+        source: source of the sequences, e.g. `Strokes`.
+        batch_size: number of sequences per batch, B.
+        length: number of steps per sequence, T. Sequences are cut or padded to it.
+        updates_per_epoch: number of training batches between validations and checkpoints.
+        seed: random seed for the order of the training batches.
+        validation_sequences: number of validation sequences used after each epoch, the first of the split.
 
     Raises:
-        ForbesError: when `length` or `batch_size` is below 1, or a batch is larger than its split.
+        ForbesError: if a number is below 1, or a batch is larger than the split.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Strokes(), batch_size=4, length=30)
@@ -97,28 +103,28 @@ class SequenceDataModule(LightningDataModule):
 
     @property
     def action_dim(self) -> int:
-        """A."""
+        """Dimension of an action, A."""
         return self.source.action_dim
 
     @property
     def discrete(self) -> bool:
-        """Whether an action is one of A, as a one-hot vector."""
+        """Whether an action is a one-hot vector."""
         return self.source.discrete
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold for the same batches: how far a growing source was read."""
+        """Return the state for a checkpoint: the number of episodes of a growing source."""
         return {} if self.source.watermark is None else {"watermark": self.source.watermark}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """See the sequences that there were at the checkpoint."""
+        """Restore the source to the episodes it had at the checkpoint."""
         self.source.watermark = state_dict["watermark"]
 
     def train_index(self, number: int) -> Tensor:
-        """Return the indices of one training batch, `(B,)`, int64."""
+        """Return the indices of training batch `number`, `(B,)`, int64."""
         return self.source.train_index(self.batch_size, self.length, self.seed, number)
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Return `updates_per_epoch` batches, after those that the trainer has taken."""
+        """Return `updates_per_epoch` batches, starting after the batches already trained on."""
         return self._loader("train", _TrainIndices(self))
 
     def val_dataloader(self) -> DataLoader[Any]:
@@ -134,11 +140,11 @@ class SequenceDataModule(LightningDataModule):
         return self.test_dataloader()
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> SequenceBatch:
-        """Decode on the device."""
+        """Decode a batch on the device."""
         return self._decode(batch)
 
     def sequences(self, split: Split, index: Tensor, length: int | None = None) -> SequenceBatch:
-        """Return chosen sequences of a split on the CPU, cut or padded to `length` (the module's own by default)."""
+        """Return sequences of a split by index on the CPU, cut or padded to `length` (default: that of the module)."""
         return self._decode(self.source.gather(split, index, length or self.length))
 
     def _decode(self, compact: Any) -> SequenceBatch:
@@ -151,7 +157,7 @@ class SequenceDataModule(LightningDataModule):
         return self._loader(split, torch.arange(min(limit or size, size)).split(4 * self.batch_size))
 
     def _loader(self, split: Split, indices: Any) -> DataLoader[Any]:
-        # A batch is gathered in less time than a worker process needs to hand it over.
-        # From pinned memory a GPU fetches it while it still computes.
+        # No workers: gathering a batch takes less time than its transfer from a worker process.
+        # Pinned memory: the copy to a GPU overlaps with its computation.
         batches = _Batches(self.source, split, self.length, indices)
         return DataLoader(batches, batch_size=None, pin_memory=torch.cuda.is_available())

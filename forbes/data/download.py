@@ -1,6 +1,6 @@
-"""Data that do not come with the package: where they are kept, how they are downloaded and recognised.
+"""Download, verify and locate data that are not part of the package.
 
-Among them the learning curves of danijar/dreamer on the DeepMind Control Suite (MIT licence).
+This includes the learning curves of danijar/dreamer on the DeepMind Control Suite (MIT licence).
 """
 
 import hashlib
@@ -33,33 +33,33 @@ _CHUNK = 2**16
 
 CURVES_URL = "https://github.com/danijar/dreamer/raw/master/scores/dreamer.json"
 CURVES_BLOB = "ab35b223497127c8eb4cf1b17db7afd4389c4faf"
-"""20 tasks, 5 seeds each, returns against env steps up to 4.9 million."""
+"""Git blob id of the curves: 20 tasks with 5 seeds each, returns against env steps up to 4.9 million."""
 
 _LOCAL = "Give a local copy with: forbes data fetch curves --from PATH"
 
 
 def bundled(name: str) -> Path:
-    """Return the path of a file that comes with the package: `forbes/data/` of a wheel, `data/` of a checkout."""
+    """Return the path of a bundled file: in `forbes/data/` of a wheel, in `data/` of a checkout."""
     in_wheel = Path(__file__).with_name(name)
     return in_wheel if in_wheel.is_file() else Path(__file__).parents[2] / "data" / name
 
 
 def data_folder() -> Path:
-    """Where they are kept: `$FORBES_DATA`, else the user's cache."""
+    """Return the folder of downloaded data: `$FORBES_DATA`, or the user's cache."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "forbes"
     return Path(os.environ.get("FORBES_DATA") or cache)
 
 
 def download(url: str, path: Path, remedy: str) -> None:
-    """Download a file, from where an earlier attempt was interrupted.
+    """Download a file. An interrupted download is resumed.
 
     Args:
-        url: of the file.
-        path: where it comes to lie once it is whole; until then `PATH.part` grows beside it.
-        remedy: what to do where it cannot be had, for errors.
+        url: address of the file.
+        path: file to write. Until it is complete, the data are in `PATH.part` in the same folder.
+        remedy: what to do if it cannot be downloaded, for the error message.
 
     Raises:
-        ForbesError: where it cannot be had, is interrupted, or is larger than any file of GitHub.
+        ForbesError: if the file cannot be downloaded, is interrupted, or is larger than any file on GitHub.
     """
     part = path.with_name(f"{path.name}.part")
     try:
@@ -70,7 +70,7 @@ def download(url: str, path: Path, remedy: str) -> None:
             _receive(response, part, url, remedy)
     except urllib.error.HTTPError as error:
         error.close()
-        if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:  # that is: there is nothing left to send
+        if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:  # nothing is left to send
             raise ForbesError(f"{url}: could not be downloaded ({error}). {remedy}") from error
     except (OSError, http.client.HTTPException) as error:
         raise ForbesError(f"{url}: could not be downloaded ({getattr(error, 'reason', error)}). {remedy}") from error
@@ -78,14 +78,14 @@ def download(url: str, path: Path, remedy: str) -> None:
 
 
 def _receive(response: http.client.HTTPResponse, part: Path, url: str, remedy: str) -> None:
-    """Write a response's body, behind what is there already if the server agreed to go on from there."""
+    """Write the body of a response, appended to the partial file if the server agreed to resume."""
     resumed = response.status == http.HTTPStatus.PARTIAL_CONTENT
     announced = response.headers["Content-Length"]
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     held = part.stat().st_size if resumed else 0
     if not resumed:
         part.unlink(missing_ok=True)
-    append_whole(part, b"")  # it is there, though nothing may come
+    append_whole(part, b"")  # create the file even if nothing is received
     with Progress(*columns) as progress:
         total = held + int(announced) if announced else None
         task = progress.add_task(url.rpartition("/")[2], total=total, completed=held)
@@ -96,11 +96,11 @@ def _receive(response: http.client.HTTPResponse, part: Path, url: str, remedy: s
             if held > _DOWNLOAD_LIMIT:
                 raise ForbesError(f"{url}: sends more than {_DOWNLOAD_LIMIT} bytes, expected a smaller file. {remedy}")
         if total is not None and held < total:
-            raise ForbesError(f"{url}: interrupted after {held} of {total} bytes. Run it again to go on.")
+            raise ForbesError(f"{url}: interrupted after {held} of {total} bytes. Run it again to resume.")
 
 
 def git_blob_id(path: Path) -> str:
-    """Name a file's content as git does: the SHA-1 of ``blob <size>``, a zero byte and the bytes."""
+    """Return the git blob id of a file: the SHA-1 of `blob <size>`, a zero byte and the content."""
     digest = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):
@@ -109,19 +109,19 @@ def git_blob_id(path: Path) -> str:
 
 
 def curves_path() -> Path:
-    """Where they are kept."""
+    """Return the path of the downloaded curves."""
     return data_folder() / "dreamer-curves.json"
 
 
 def fetch_curves(source: Path | None, destination: Path) -> None:
-    """Store the curves, verified.
+    """Download or copy the curves, and verify them.
 
     Args:
-        source: a copy of the file; None downloads it.
-        destination: where it comes to lie, whole or not at all.
+        source: local copy of the file; None downloads it.
+        destination: file to write, complete or not at all.
 
     Raises:
-        ForbesError: where it cannot be had, or is another file.
+        ForbesError: if the file cannot be downloaded, or its hash is wrong.
     """
     new = destination.with_name(f"{destination.name}.new")
     if source is None:
@@ -130,7 +130,7 @@ def fetch_curves(source: Path | None, destination: Path) -> None:
         new.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, new)
     else:
-        raise ForbesError(f"{source}: there is no such file. {_LOCAL}")
+        raise ForbesError(f"{source}: no such file. {_LOCAL}")
     found = git_blob_id(new)
     if found != CURVES_BLOB:
         new.unlink()

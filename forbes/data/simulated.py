@@ -1,4 +1,4 @@
-"""Sequences of a known process, drawn once: data whose belief and whose likelihood are known exactly."""
+"""Sequences sampled once from a known process, so that exact beliefs and likelihoods are available."""
 
 import hashlib
 from typing import NamedTuple, get_args
@@ -18,7 +18,7 @@ __all__ = ["Simulated", "SimulatedSequences"]
 
 @printed_by_shape
 class SimulatedSequences(NamedTuple):
-    """Some sequences in full."""
+    """Observations, actions and states of some sequences."""
 
     observation: Tensor
     """o_t, float32 (B, T, O)."""
@@ -29,17 +29,17 @@ class SimulatedSequences(NamedTuple):
 
 
 class Simulated(SequenceSource):
-    """Sequences of a process under its random policy, drawn once per split.
+    """Sequences of a process under its random policy, sampled once per split.
 
     Args:
-        process: e.g. `MirrorSensor`.
-        train: sequences of the training split.
-        validation: of the validation split.
-        test: of the test split.
-        seed: of the sequences; the same for every training, so that models are compared on the same data.
+        process: process to sample from, e.g. `MirrorSensor`.
+        train: number of training sequences.
+        validation: number of validation sequences.
+        test: number of test sequences.
+        seed: random seed for the sequences, independent of the training seed, so that all models see the same data.
 
     Raises:
-        ForbesError: when a split would be empty.
+        ForbesError: if a split would be empty.
 
     Example:
         >>> source = forbes.Simulated(forbes.MirrorSensor(), train=100)
@@ -59,7 +59,7 @@ class Simulated(SequenceSource):
         self._drawn: dict[tuple[Split, int], Trajectories] = {}
 
     def trajectories(self, split: Split, length: int) -> Trajectories:
-        """Return all sequences of a split with their hidden states, float64; they depend on the length, too."""
+        """Return all sequences of a split with their hidden states, float64. Other lengths are other sequences."""
         if (split, length) not in self._drawn:
             self._drawn[split, length] = self._draw(split, self.size(split), length)
         return self._drawn[split, length]
@@ -68,7 +68,7 @@ class Simulated(SequenceSource):
         return self.process.sample(sequences, length, generator(self.seed, f"simulated {split}", length))
 
     def sha256(self) -> str:
-        """Hash some sequences of each split: they tell the process, its numbers, the seed and the library's version."""
+        """Hash ten sequences of each split, which depend on the process, its parameters, the seed and the code."""
         digest = hashlib.sha256()
         for split in get_args(Split):
             digest.update(f"{split} {self.size(split)}".encode())
@@ -77,16 +77,16 @@ class Simulated(SequenceSource):
         return digest.hexdigest()
 
     def size(self, split: Split) -> int:
-        """Count the sequences of a split."""
+        """Return the number of sequences of a split."""
         return {"train": self.train, "validation": self.validation, "test": self.test}[split]
 
     def gather(self, split: Split, index: Tensor, length: int) -> SimulatedSequences:
-        """Collect sequences by index, int64 (B,), of `length` steps each."""
+        """Return sequences by index, int64 (B,), with `length` steps each."""
         drawn = self.trajectories(split, length)
         return SimulatedSequences(*(values[index].float() for values in (drawn.observation, drawn.action, drawn.state)))
 
     def decode(self, compact: SimulatedSequences) -> SequenceBatch:
-        """Add what these sequences have not: rewards, padding and ends."""
+        """Add rewards and ends, which are all 0, and the mask, which is all True."""
         observation, action, state = compact
         shape, device = observation.shape[:2], observation.device
         mask = torch.ones(shape, dtype=torch.bool, device=device)

@@ -1,4 +1,4 @@
-"""What a data source gives: sequences of observations, addressed by split and index."""
+"""The interface of data sources: sequences of observations, addressed by split and index."""
 
 from abc import ABC, abstractmethod
 from functools import lru_cache
@@ -19,7 +19,7 @@ __all__ = ["SequenceBatch", "SequenceSource", "Split", "check_batch", "check_sou
 
 @printed_by_shape
 class SequenceBatch(NamedTuple):
-    """Sequences, batch first. Index t holds (o_t, a_{t-1}, r_t): the action that led to o_t, zero at the start.
+    """Sequences, batch first. Index t has (o_t, a_{t-1}, r_t): the action is the one that led to o_t, 0 at the start.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
@@ -39,56 +39,68 @@ class SequenceBatch(NamedTuple):
     mask: Tensor
     """True where the step belongs to the sequence, False on padding, bool (B, T)."""
     state: Tensor
-    """s_t of the process where the source knows it, float32 (B, T, D), else D = 0; a world model never sees it."""
+    """s_t of the process, float32 (B, T, D), with D = 0 if it is unknown. World models do not use it."""
     ended: Tensor
-    """True where the process has ended at that step, by itself and not by a time limit, bool (B, T)."""
+    """True at the step where the process terminated (not truncated by a time limit), bool (B, T)."""
+
+    def to(self, device: torch.device | str) -> "SequenceBatch":
+        """Move the batch to a device."""
+        return SequenceBatch(*(values.to(device) for values in self))
+
+    def first(self, steps: int) -> "SequenceBatch":
+        """Return the first steps of all sequences, `(B, steps, ...)`."""
+        return SequenceBatch(*(values[:, :steps] for values in self))
+
+    def rows(self, rows: slice) -> "SequenceBatch":
+        """Return some of the sequences."""
+        return SequenceBatch(*(values[rows] for values in self))
 
 
 class SequenceSource(Named, ABC):
-    """A set of sequences. To add one, copy `strokes.py`: four methods and two numbers.
+    """A set of sequences. To add one, copy `strokes/source.py`: four methods and two attributes.
 
-    `gather` runs on the CPU and returns the most compact tensors that determine the batch (a NamedTuple of tensors);
-    `decode` turns them into a `SequenceBatch` on whatever device they have been moved to.
+    `gather` runs on the CPU and returns compact tensors that determine the batch (a NamedTuple of tensors). `decode`
+    turns them into a `SequenceBatch` on the device to which they were moved.
     """
 
     observation_shape: tuple[int, ...]
     """Shape of one observation, without batch and time."""
     action_dim: int
-    """A, 0 for a process without actions."""
+    """Dimension of an action, A; 0 for a process without actions."""
     discrete: bool = False
-    """Whether an action is one of A, as a one-hot vector."""
+    """Whether an action is a one-hot vector."""
     increments: bool = False
-    """Whether o_t is what step t adds to a picture, pixels of 0 and 1, not the picture itself."""
+    """Whether o_t has the pixels (0 or 1) that step t adds to an image, instead of the image itself."""
     watermark: int | None = None
-    """Up to where a source that grows was read; a checkpoint keeps it, and a resumed run sets it again."""
+    """Number of episodes of a growing source. A checkpoint stores it, and a resumed run restores it."""
 
     @abstractmethod
     def sha256(self) -> str:
-        """Hash what all the sequences are made of, for the record of a run."""
+        """Return a hash of all sequences, for the record of a run."""
 
     @abstractmethod
     def size(self, split: Split) -> int:
-        """Count the sequences of a split."""
+        """Return the number of sequences of a split."""
 
     @abstractmethod
     def gather(self, split: Split, index: Tensor, length: int) -> Any:
-        """Collect sequences by index, int64 (B,), cut or padded to `length` steps; compact, on the CPU."""
+        """Return sequences by index, int64 (B,), cut or padded to `length` steps, in compact form on the CPU."""
 
     @abstractmethod
     def decode(self, compact: Any) -> SequenceBatch:
-        """Turn what `gather` returned into a batch, on the device it lies on."""
+        """Return the batch for the output of `gather`, on its device."""
 
     def train_index(self, batch_size: int, length: int, seed: int, update: int) -> Tensor:
         """Return the indices of one training batch, int64 `(B,)`: shuffled passes over the split, without replacement.
 
         Args:
-            batch_size: B.
-            length: T that `gather` will be asked for.
-            seed: of the order.
-            update: number of the batch; with the seed it determines it.
+            batch_size: number of sequences per batch, B.
+            length: number of steps per sequence, T.
+            seed: random seed for the order.
+            update: index of the batch.
 
         Raises:
-            ForbesError: when a batch is larger than the split.
+            ForbesError: if a batch is larger than the split.
         """
         size = self.size("train")
         if batch_size > size:
@@ -96,13 +108,14 @@ class SequenceSource(Named, ABC):
                 f"SequenceDataModule: batch_size is {batch_size}, but the training split has {size} sequences. "
                 "Choose a smaller batch_size"
             )
-        turn, place = divmod(update, size // batch_size)
-        return _order(seed, turn, size)[place * batch_size : (place + 1) * batch_size]  # (B,)
+        epoch, batch = divmod(update, size // batch_size)
+        return _order(seed, epoch, size)[batch * batch_size : (batch + 1) * batch_size]  # (B,)
 
     def pictures(self, observation: Tensor) -> Tensor:
-        r"""Return what a person is shown of observations from the first step on, `(B, T, *O)`.
+        r"""Return the images to show for observations from the first step on, `(B, T, *O)`.
 
-        Increments add up: a pixel is on that any step so far has put on. Of probabilities it is how likely that is,
+        Increments are accumulated: a pixel is on if any step so far has set it. For pixel probabilities, the result is
+        the probability that it is on,
 
         .. math:: \text{picture}_t = 1 - \prod_{u \le t} (1 - x_u)
         """
@@ -111,12 +124,12 @@ class SequenceSource(Named, ABC):
         return 1 - (1 - observation).cumprod(1, dtype=observation.dtype)
 
     def latest(self, count: int) -> Tensor:
-        """Return training sequences to look at, those first that were learned from least; int64 `(count,)` or fewer."""
+        """Return indices of training sequences to show, newest first if the source grows; int64 `(count,)` or fewer."""
         return torch.arange(min(count, self.size("train")))
 
 
 def check_source(source: SequenceSource) -> None:
-    """Raise a ForbesError unless a source says its shapes; properties are left for later, since they may cost."""
+    """Raise a ForbesError unless a source defines its shapes. Properties are not evaluated, since that may be slow."""
     kind = type(source).__name__
     for name, expected in (("observation_shape", "(C, H, W) or (O,)"), ("action_dim", "a whole number, at least 0")):
         if getattr_static(source, name, None) is None:
@@ -124,10 +137,10 @@ def check_source(source: SequenceSource) -> None:
 
 
 def check_batch(source: SequenceSource, batch: SequenceBatch) -> None:
-    """Raise a ForbesError unless a batch is what `SequenceBatch` says, of the shapes that its source says."""
+    """Raise a ForbesError unless a batch is a `SequenceBatch` with the shapes and dtypes of its source."""
     kind, shape = type(source).__name__, tuple(source.observation_shape)
     if not isinstance(batch, SequenceBatch):
-        raise ForbesError(f"{kind}: decode gives a {type(batch).__name__}, expected a SequenceBatch. Return one")
+        raise ForbesError(f"{kind}: decode returns a {type(batch).__name__}, expected a SequenceBatch. Change decode")
     steps = tuple(batch.mask.shape)  # (B, T)
     expected: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
         "observation": (torch.uint8 if len(shape) == 3 else torch.float32, (*steps, *shape)),
@@ -141,16 +154,16 @@ def check_batch(source: SequenceSource, batch: SequenceBatch) -> None:
         values: Tensor = getattr(batch, name)
         if values.dtype != dtype or tuple(values.shape) != size:
             raise ForbesError(
-                f"{kind}: decode gives {name} {_said(values.dtype)} {tuple(values.shape)}, expected {_said(dtype)} "
+                f"{kind}: decode returns {name} {_name(values.dtype)} {tuple(values.shape)}, expected {_name(dtype)} "
                 f"{size}. Change decode, or observation_shape and action_dim"
             )
 
 
-def _said(dtype: torch.dtype) -> str:
+def _name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
 @lru_cache(maxsize=2)
-def _order(seed: int, turn: int, size: int) -> Tensor:
-    """Shuffle a split for one pass over it."""
-    return torch.randperm(size, generator=generator(seed, "order", turn))
+def _order(seed: int, epoch: int, size: int) -> Tensor:
+    """Return the shuffled indices of a split for one pass over it."""
+    return torch.randperm(size, generator=generator(seed, "order", epoch))

@@ -1,6 +1,6 @@
-"""Environments an agent acts in, behind one small interface, and the process that owns one.
+"""Environments for agents, with one small interface, and a worker process that runs one.
 
-Nothing here imports a simulator, torch or gymnasium before it is asked for: a worker starts in a fraction of a second.
+Simulators, torch and gymnasium are imported only when they are needed, so a worker starts in a fraction of a second.
 """
 
 from forbes.envs.base import TIME_LIMIT, Environment, Step

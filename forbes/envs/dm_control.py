@@ -1,4 +1,4 @@
-"""Tasks of the DeepMind Control Suite (Tassa et al., 2018, arXiv 1801.00690), from pixels or from the physics."""
+"""Tasks of the DeepMind Control Suite (Tassa et al., 2018, arXiv 1801.00690), with pixels or state vectors."""
 
 import difflib
 import json
@@ -20,35 +20,36 @@ from forbes.errors import ForbesError
 __all__ = ["DeepMindControl", "measure"]
 
 _NO_RENDERING = "disable"
-"""The value of MUJOCO_GL with which dm_control loads no backend."""
+"""Value of MUJOCO_GL for which dm_control loads no backend."""
 _NO_BOUND = 1e10
-"""MuJoCo's largest number, which the suite gives where an actuator has no bound."""
-_FRAMES = 10  # to measure
+"""MuJoCo's largest number, which the suite uses for an actuator without bounds."""
+_FRAMES = 10  # number of frames to measure the speed
 
 
 class DeepMindControl(Environment):
-    r"""A task of the suite, by the name of its domain and its own: `cartpole_swingup`, `ball_in_cup_catch`.
+    r"""A task of the suite, named by domain and task, e.g. `cartpole_swingup`, `ball_in_cup_catch`.
 
-    An action in [-1, 1]^A is scaled to the actuators' bounds and held for R frames, whose rewards add up:
+    An action in [-1, 1]^A is scaled to the bounds of the actuators and repeated for R frames, whose rewards are summed:
 
     .. math:: r_{t+1} = \sum_{i=1}^{R} r(s_{t,i}, a_t)
 
-    The time limit of 1000 frames is a truncation; the suite says so by a discount of 1. The two tasks without one,
-    `lqr`, have actions without bounds, and are refused. Defaults are those of Dreamer
-    (arXiv 1912.01603): two frames, 64 x 64 pixels, camera 0, of the quadruped 2.
+    The time limit of 1000 frames is a truncation, which the suite marks by a discount of 1. The two tasks without a
+    time limit, `lqr`, have unbounded actions and are refused. Defaults are those of Dreamer (arXiv 1912.01603): two
+    frames, 64 x 64 pixels, camera 0, for the quadruped camera 2.
 
     Args:
-        task: the name.
-        pixels: observe uint8 `(3, size, size)`; else what the task measures, float32 `(O,)`, in the suite's order.
-        action_repeat: R.
-        camera: number of the camera.
-        size: pixels a side.
-        fast: render without shadows, which on a processor cost more than all the rest; other pixels, so not for
-            published numbers. Multisampling stays: without it a thin pole falls between the pixels of a small frame.
-        backend: of OpenGL, proved to render; by default the one that `choose_backend` proves.
+        task: name of the task.
+        pixels: observe images, uint8 `(3, size, size)`; otherwise the task's measurements, float32 `(O,)`, in the
+            suite's order.
+        action_repeat: number of frames per action, R.
+        camera: index of the camera.
+        size: side of the images in pixels.
+        fast: render without shadows, which on a CPU take most of the time. This changes the pixels, so it is not for
+            published results. Multisampling stays on: without it a thin pole vanishes in a small image.
+        backend: OpenGL backend that is known to render. Default: the one of `choose_backend`.
 
     Raises:
-        ForbesError: for an unknown task or camera, one without bounds of its actions, or when nothing renders.
+        ForbesError: for an unknown task or camera, unbounded actions, or if no backend renders.
 
     Example:
         >>> environment = forbes.DeepMindControl("cartpole_swingup", pixels=False)
@@ -69,7 +70,7 @@ class DeepMindControl(Environment):
         backend: str | None = None,
     ) -> None:
         require_repeat(task, action_repeat)
-        if find_spec("dm_control") is None:  # before what renders is looked for, which would say so of every backend
+        if find_spec("dm_control") is None:  # before the backends are probed, which would all fail for this reason
             raise ForbesError(f"{task}: dm_control is not installed. pip install 'forbes[dmc]'")
         self.task, self.pixels, self.action_repeat, self.size, self.fast = task, pixels, action_repeat, size, fast
         self.backend = (backend or choose_backend().backend) if pixels else _NO_RENDERING
@@ -78,7 +79,7 @@ class DeepMindControl(Environment):
         self._low, self._high, self.action_dim = spec.minimum, spec.maximum, spec.shape[0]
         if (self._high >= _NO_BOUND).any():
             raise ForbesError(
-                f"{task}: its actions have no bounds that [-1, 1] could be scaled to. Choose another task"
+                f"{task}: its actions are unbounded, so [-1, 1] cannot be scaled to them. Choose another task"
             )
         self.camera = camera if camera is not None else 2 if task.startswith("quadruped") else 0
         self.observation_shape = (3, size, size) if pixels else self.reset(0).observation.shape
@@ -86,7 +87,7 @@ class DeepMindControl(Environment):
             self._prepare_rendering()
 
     def _prepare_rendering(self) -> None:
-        """Set what cannot be changed after the first frame."""
+        """Set the rendering options that cannot be changed after the first frame."""
         model = self._environment.physics.model
         if not 0 <= self.camera < model.ncam:
             raise ForbesError(f"{self.task}: has no camera {self.camera}, expected 0 to {model.ncam - 1}. Choose one")
@@ -95,12 +96,12 @@ class DeepMindControl(Environment):
             model.vis.quality.shadowsize = 0
 
     def reset(self, seed: int) -> Step:
-        """See `Environment.reset`: all the chance of an episode comes from the task's generator."""
+        """Start the episode of a seed. The task's generator is its only source of randomness."""
         self._environment.task.random.seed(seed)
         return Step(self._observe(self._environment.reset()))
 
     def step(self, action: NDArray[np.float32]) -> Step:
-        """See `Environment.step`; only the last frame is rendered."""
+        """Apply an action, float32 `(A,)`; only the last frame is rendered."""
         scaled = scale_action(action, self._low, self._high)
         last: Any = None
 
@@ -121,7 +122,7 @@ class DeepMindControl(Environment):
         return np.ascontiguousarray(frame.transpose(2, 0, 1))  # (3, H, W)
 
     def describe(self) -> dict[str, Any]:
-        """See `Environment.describe`."""
+        """Return task, rendering options and versions."""
         made_by = {name: version(name) for name in ("dm-control", "mujoco")}
         if not self.pixels:
             return {"task": self.task, "pixels": False, "made_by": made_by}
@@ -129,7 +130,7 @@ class DeepMindControl(Environment):
         return {"task": self.task, "pixels": True, "camera": self.camera, "fast": self.fast, "made_by": made_by}
 
     def _gl_renderer(self) -> str:
-        """Name the device or the software that draws."""
+        """Return the name of the device or software that renders."""
         from OpenGL import GL
 
         with self._environment.physics.contexts.gl.make_current() as context:
@@ -141,26 +142,26 @@ def _load(task: str, backend: str) -> Any:
     """Import the suite for a backend and load a task.
 
     Raises:
-        ForbesError: where it was imported for another backend, or has no such task.
+        ForbesError: if it was imported for another backend, or there is no such task.
     """
-    with _environment_variable("MUJOCO_GL", backend):  # it is read at the first import
+    with _environment_variable("MUJOCO_GL", backend):  # read at the first import
         from dm_control import _render, suite
     if backend not in (_NO_RENDERING, _render.BACKEND):
         raise ForbesError(
             f"{task}: this process has imported dm_control with MUJOCO_GL={_render.BACKEND}, expected {backend}. "
-            "Import nothing of it before, or use EnvironmentProcess"
+            "Do not import it before, or use EnvironmentProcess"
         )
     names = {f"{domain}_{name}": (domain, name) for domain, name in suite.ALL_TASKS}
     if task not in names:
         near = difflib.get_close_matches(task, names, n=3, cutoff=0.5)
-        hint = f"Did you mean {' or '.join(near)}?" if near else "`forbes data collect --help` says what there is"
+        hint = f"Did you mean {' or '.join(near)}?" if near else "`forbes data collect --help` lists the tasks"
         raise ForbesError(f"{task}: no such task. {hint}")
     return suite.load(*names[task])
 
 
 @contextmanager
 def _environment_variable(name: str, value: str) -> Iterator[None]:
-    """Set a variable of the process for a while."""
+    """Set an environment variable inside the `with` block."""
     before = os.environ.get(name)
     os.environ[name] = value
     try:
@@ -173,14 +174,14 @@ def _environment_variable(name: str, value: str) -> Iterator[None]:
 
 
 def measure(backend: str) -> None:
-    """Print GL_RENDERER and frames per second as JSON; in the probe's own process.
+    """Print GL_RENDERER and frames per second as JSON. Runs in the process of `probe_backend`.
 
     Raises:
-        RuntimeError: when the same state does not give the same frame.
+        RuntimeError: if the same state is rendered as two different frames.
     """
     environment = DeepMindControl("cartpole_balance", action_repeat=1, backend=backend)
     if (environment.reset(0).observation != environment.reset(0).observation).any():
-        raise RuntimeError("the same state gives two different frames")
+        raise RuntimeError("the same state is rendered as two different frames")
     action, began = np.zeros(environment.action_dim, np.float32), time.perf_counter()
     for _ in range(_FRAMES):
         environment.step(action)

@@ -1,4 +1,4 @@
-"""Any single environment of Gymnasium (Towers et al., 2024, arXiv 2407.17032), by its id."""
+"""Environments of Gymnasium (Towers et al., 2024, arXiv 2407.17032), by id."""
 
 import difflib
 import warnings
@@ -15,27 +15,27 @@ __all__ = ["Gymnasium"]
 
 
 class Gymnasium(Environment):
-    """An environment of Gymnasium: `Pendulum-v1`, or `package:Name-v0` of a package that registers its own.
+    """An environment of Gymnasium, e.g. `Pendulum-v1`, or `package:Name-v0` for a package that registers it.
 
-    Observations are images, uint8 `(C, H, W)`, where the space is a uint8 Box of 0 to 255 with 1, 3 or 4 channels or
-    none; else float32 vectors: numbers of a Box, one-hot of a Discrete or a MultiDiscrete, and one after the other the
-    parts of a Dict or a Tuple. Whole numbers between two bounds are scaled to [0, 1], and text is left out. With
-    `pixels` the observation is what the environment draws.
+    Observations are images, uint8 `(C, H, W)`, if the space is a uint8 Box of 0 to 255 with 1, 3 or 4 channels or
+    without a channel dimension. Otherwise they are float32 vectors: values of a Box, one-hot vectors for a Discrete or
+    MultiDiscrete, and the concatenated parts of a Dict or Tuple. Integers of a Box with two bounds are scaled to
+    [0, 1], and text is ignored. With `pixels` the observation is the rendered image.
 
-    Actions of a Box are scaled from [-1, 1] to its bounds (`scale_action`), its whole numbers with equal shares; those
-    of a Discrete are one-hot. Its `TimeLimit` is a truncation.
+    Actions of a Box are scaled from [-1, 1] to its bounds (`scale_action`), with equal intervals for integers. Actions
+    of a Discrete are one-hot. Gymnasium's `TimeLimit` is a truncation.
 
     Args:
-        task: the id.
-        pixels: observe what it draws, uint8 `(3, size, size)`. The environment itself chooses what draws: those of
-            MuJoCo read MUJOCO_GL, for which `forbes doctor` says what works here.
-        action_repeat: steps of Gymnasium for which an action is held; their rewards add up.
-        size: pixels a side of images; by default 64 with `pixels`, else as they are.
-        part: name of the entry of a Dict that is observed, e.g. `image` of MiniGrid; by default all are.
+        task: id of the environment.
+        pixels: observe rendered images, uint8 `(3, size, size)`. The environment chooses the renderer; those of MuJoCo
+            read MUJOCO_GL, for which `forbes doctor` reports the working values.
+        action_repeat: number of Gymnasium steps per action. Their rewards are summed.
+        size: side of the images in pixels. Default: 64 with `pixels`, otherwise the original size.
+        part: entry of a Dict observation to use, e.g. `image` in MiniGrid. Default: all entries.
 
     Raises:
-        ForbesError: for an unknown id, a space of actions or observations that is none of these, or where gymnasium is
-            missing.
+        ForbesError: for an unknown id, an unsupported space of actions or observations, or if gymnasium is not
+            installed.
 
     Example:
         >>> environment = forbes.Gymnasium("CartPole-v1")
@@ -70,12 +70,12 @@ class Gymnasium(Environment):
         self.observation_shape = self.reset(0).observation.shape
 
     def reset(self, seed: int) -> Step:
-        """See `Environment.reset`."""
+        """Start the episode of a seed."""
         observation, _ = self._environment.reset(seed=seed)
         return Step(self._observe(observation))
 
     def step(self, action: NDArray[np.float32]) -> Step:
-        """See `Environment.step`."""
+        """Apply an action, float32 `(A,)`."""
         taken = self._spaces.to_action(self._actions, action)
         last: Any = None
 
@@ -96,23 +96,23 @@ class Gymnasium(Environment):
         return self._spaces.flatten(self._seen, observation)
 
     def describe(self) -> dict[str, Any]:
-        """See `Environment.describe`."""
+        """Return task, kind of observation and version."""
         part = {} if self.part is None else {"part": self.part}
         made_by = {"gymnasium": version("gymnasium")}
         return {"task": f"gymnasium:{self.task}", "pixels": self.pixels, **part, "made_by": made_by}
 
 
 def _make(task: str, pixels: bool) -> Any:
-    """Make an environment, one that draws with `pixels`; not every constructor has a `render_mode`."""
+    """Make an environment, with rendering if `pixels` is set; not every constructor has a `render_mode`."""
     try:
         import gymnasium
     except ModuleNotFoundError as error:
         raise ForbesError(f"{task}: gymnasium is not installed. pip install 'forbes[gym]'") from error
-    blind = f"{task}: it draws no pictures (render_mode rgb_array), expected them for pixels. Leave pixels out"
+    blind = f"{task}: it does not render images (render_mode rgb_array), as needed for pixels. Do not set pixels"
     options: dict[str, Any] = {"render_mode": "rgb_array"} if pixels else {}
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*is not in the possible render_modes.*")  # said below, as an error
+            warnings.filterwarnings("ignore", ".*is not in the possible render_modes.*")  # an error is raised below
             environment: Any = gymnasium.make(task, **options)
     except TypeError as error:
         if "'render_mode'" not in str(error):
@@ -123,7 +123,7 @@ def _make(task: str, pixels: bool) -> Any:
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         name = task.rpartition(":")[2]
         near = difflib.get_close_matches(name, gymnasium.registry, n=3)
-        hint = f". Did you mean {' or '.join(near)}?" if near else f" ({error}). Name one that is registered"
+        hint = f". Did you mean {' or '.join(near)}?" if near else f" ({error}). Use a registered id"
         raise ForbesError(f"{task}: gymnasium has no such environment{hint}") from error
     if pixels and "rgb_array" not in environment.metadata.get("render_modes", []):
         raise ForbesError(blind)
@@ -131,12 +131,12 @@ def _make(task: str, pixels: bool) -> Any:
 
 
 def _entry(task: str, space: Any, part: str | None) -> Any:
-    """Return the space of an entry of a Dict, or the whole."""
+    """Return the space of an entry of a Dict, or the whole space."""
     if part is None:
         return space
     names = list(getattr(space, "spaces", []))
     if part not in names:
         raise ForbesError(
-            f"{task}: part is {part!r}, expected one of {', '.join(map(str, names)) or 'a Dict'}. Choose it"
+            f"{task}: part is {part!r}, expected one of {', '.join(map(str, names)) or 'a Dict'}. Choose one"
         )
     return space.spaces[part]

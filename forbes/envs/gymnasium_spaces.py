@@ -1,4 +1,4 @@
-"""From the spaces of Gymnasium to the arrays that an `Environment` gives and takes; only this imports gymnasium."""
+"""Convert between the spaces of Gymnasium and the arrays of an `Environment`. Imports gymnasium."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ __all__ = ["flatten", "is_image", "require_actions", "require_observations", "to
 
 _FLAT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _CHANNELS = (1, 3, 4)
-_REGISTER = "Wrap it in a module of your own that registers it, and name that: gymnasium:MODULE:ID"
+_REGISTER = "Wrap and register it in a module of your own, and use: gymnasium:MODULE:ID"
 
 
 def is_image(space: Any) -> bool:
-    """Tell whether a space is a uint8 Box of 0 to 255, `(H, W)` or of 1, 3 or 4 channels, first or last."""
+    """Return whether a space is a uint8 Box of 0 to 255, `(H, W)` or with 1, 3 or 4 channels, first or last."""
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
         return False
     channels = len(space.shape) == 2 or space.shape[0] in _CHANNELS or space.shape[-1] in _CHANNELS
@@ -28,8 +28,8 @@ def to_image(pixels: Any, size: int | None = None) -> NDArray[np.uint8]:
     """Return pixels `(H, W)`, `(H, W, C)` or `(C, H, W)` as uint8 `(C, H, W)`.
 
     Args:
-        pixels: the image, uint8.
-        size: pixels a side, each the mean of those it covers; None keeps them all.
+        pixels: image, uint8.
+        size: side of the result in pixels, resized by averaging; None keeps the original size.
     """
     image = np.atleast_3d(pixels)  # (H, W, C) or (C, H, W)
     if image.shape[-1] in _CHANNELS:
@@ -45,13 +45,13 @@ def to_image(pixels: Any, size: int | None = None) -> NDArray[np.uint8]:
 def flatten(space: Any, value: Any) -> NDArray[np.float32]:
     """Return a value of a space as a vector, float32 `(O,)`.
 
-    It is what `gymnasium.spaces.flatten` makes of it, except that whole numbers of a Box with two bounds are scaled
-    to [0, 1], and that text is left out.
+    The result is that of `gymnasium.spaces.flatten`, except that integers of a Box with two bounds are scaled to
+    [0, 1], and text is ignored.
     """
     if isinstance(space, spaces.Dict):
         return np.concatenate([flatten(part, value[name]) for name, part in space.spaces.items()])
     if isinstance(space, spaces.Tuple):
-        return np.concatenate([flatten(part, each) for part, each in zip(space.spaces, value, strict=True)])
+        return np.concatenate([flatten(part, entry) for part, entry in zip(space.spaces, value, strict=True)])
     if _is_text(space):
         return np.empty(0, np.float32)
     flat = np.asarray(spaces.flatten(space, value))  # (O,)
@@ -63,7 +63,7 @@ def flatten(space: Any, value: Any) -> NDArray[np.float32]:
 
 
 def require_observations(task: str, space: Any) -> None:
-    """Raise a ForbesError unless `flatten` takes every part of a space."""
+    """Raise a ForbesError unless `flatten` supports every part of a space."""
     for part in _parts(space):
         if not isinstance(part, _FLAT) and not _is_text(part):
             raise ForbesError(
@@ -75,16 +75,16 @@ def require_observations(task: str, space: Any) -> None:
 
 
 def require_actions(task: str, space: Any) -> None:
-    """Raise a ForbesError unless `to_action` gives what a space holds."""
+    """Raise a ForbesError unless `to_action` supports a space."""
     if not isinstance(space, spaces.Box | spaces.Discrete):
         kind = type(space).__name__
         raise ForbesError(f"{task}: its actions are a {kind}, expected a Box or a Discrete. {_REGISTER}")
 
 
 def to_action(space: Any, action: NDArray[np.float32]) -> Any:
-    r"""Return the member of a Box or a Discrete that an action means, float32 `(A,)` in [-1, 1] or one-hot.
+    r"""Return the member of a Box or Discrete for an action, float32 `(A,)` in [-1, 1] or one-hot.
 
-    Reals of a Box are `scale_action`; whole numbers from l to h have equal shares of [-1, 1]:
+    Real values of a Box are scaled by `scale_action`. Integers from l to h have equal intervals of [-1, 1]:
 
     .. math:: \min(h, \lfloor l + (a + 1)(h - l + 1) / 2 \rfloor)
     """
@@ -99,19 +99,19 @@ def to_action(space: Any, action: NDArray[np.float32]) -> Any:
 
 
 def _bounds(space: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return low and high of a Box, `(O,)`; a missing bound is infinite, of integers too."""
+    """Return low and high of a Box, `(O,)`. A missing bound is infinite, also for integers."""
     low = np.where(space.bounded_below, space.low, -np.inf).ravel().astype(np.float64)
     high = np.where(space.bounded_above, space.high, np.inf).ravel().astype(np.float64)
     return low, high
 
 
 def _is_text(space: Any) -> bool:
-    """Tell whether a space holds text; packages have classes of their own for it, as MiniGrid for its mission."""
+    """Return whether a space holds text. Packages define their own classes for it, e.g. MiniGrid for its mission."""
     return space.dtype is not None and space.dtype.kind == "U"
 
 
 def _parts(space: Any) -> list[Any]:
-    """List what the Dicts and Tuples of a space are made of."""
+    """Return the leaves of nested Dicts and Tuples."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         members = space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
         return [part for member in members for part in _parts(member)]

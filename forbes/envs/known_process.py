@@ -1,4 +1,4 @@
-"""A process whose belief is known exactly, as an environment: a learned agent can be held against the exact belief."""
+"""Environments of processes with a known belief, so that an agent can be compared with the exact belief."""
 
 from typing import Any, Literal, get_args
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from forbes.envs.base import Environment, Step
 from forbes.errors import ForbesError
-from forbes.pomdps import CategoricalBelief, ExactBelief, GaussianMixtureBelief, Process
+from forbes.pomdps import ExactBelief, FiniteBelief, GaussianMixtureBelief, Process
 from forbes.pomdps.base import require_positive
 from forbes.pomdps.hmm import FiniteProcess
 
@@ -19,26 +19,26 @@ Shown = Literal["observation", "exact_belief", "nothing"]
 
 
 class KnownProcess(Environment):
-    r"""An environment whose hidden state is a `Process`'s.
+    r"""An environment whose hidden state is that of a `Process`.
 
     .. math:: s_{t+1} \sim p(s \mid s_t, c\,a_t), \qquad o_{t+1} \sim p(o \mid s_{t+1}), \qquad
               r_{t+1} = r(s_t, c\,a_t, s_{t+1})
 
-    c is `Process.action_scale`, so that an agent's actions fill [-1, 1]; those of finite processes are one-hot.
-    `Process.exact_filter` of an episode takes its observations and c times its actions.
+    c is `Process.action_scale`, so that actions of an agent are in [-1, 1]; those of finite processes are one-hot. To
+    filter an episode with `Process.exact_filter`, pass its observations and c times its actions.
 
-    Two references for an agent that filters. `shows="exact_belief"` shows, in place of o_t, what determines
+    Two values of `shows` are references for an agent that filters. "exact_belief" replaces o_t by the parameters of
     p(s_t | o_1:t, a_1:t-1): probabilities of finite states, or weights, means and standard deviations of a Gaussian
-    mixture; what the agent earns then is what perfect filtering is worth to it. `shows="nothing"` shows zeros; what it
-    earns then needs no observation at all.
+    mixture. The return is then that of perfect filtering. "nothing" replaces o_t by zeros. The return is then that
+    without any observation.
 
     Args:
-        process: one that has rewards, e.g. `MountainHike`.
-        time_limit: steps after which an episode is truncated.
+        process: process with rewards, e.g. `MountainHike`.
+        time_limit: number of steps after which an episode is truncated.
         shows: "observation", "exact_belief" or "nothing".
 
     Raises:
-        ForbesError: where `shows` is none of these, or the exact belief has no such numbers.
+        ForbesError: if `shows` has another value, or the exact belief has no such parameters.
     """
 
     def __init__(self, process: Process, time_limit: int = 75, shows: Shown = "observation") -> None:
@@ -53,7 +53,7 @@ class KnownProcess(Environment):
             self.observation_shape = self.reset(0).observation.shape
 
     def reset(self, seed: int) -> Step:
-        """See `Environment.reset`."""
+        """Start the episode of a seed."""
         self._generator = torch.Generator().manual_seed(seed)
         self._time = 0
         like = torch.zeros(1, self.process.action_dim, dtype=torch.float64)
@@ -63,7 +63,7 @@ class KnownProcess(Environment):
         return Step(self._observe())
 
     def step(self, action: NDArray[np.float32]) -> Step:
-        """See `Environment.step`."""
+        """Apply an action, float32 `(A,)`."""
         taken = self.process.action_scale * torch.from_numpy(action).double().unsqueeze(0)  # (1, A)
         before = self._state
         self._taken.append(taken)
@@ -81,23 +81,23 @@ class KnownProcess(Environment):
             return seen.flatten().float().numpy()  # (O,)
         self._seen.append(seen.squeeze(0))
         history = (torch.stack(values, 1) for values in (self._seen, self._taken))  # (1, t, O), (1, t, A)
-        return _numbers(self.process.exact_filter(*history).belief).float().numpy()  # (O,)
+        return _parameters(self.process.exact_filter(*history).belief).float().numpy()  # (O,)
 
     def describe(self) -> dict[str, Any]:
-        """See `Environment.describe`: the process's numbers are those of its attributes."""
+        """Return task, settings and the plain attributes of the process."""
         plain = {name: value for name, value in vars(self.process).items() if isinstance(value, int | float | str)}
         made_by = {"torch": torch.__version__}
         known = {"time_limit": self.time_limit, "shows": self.shows}
         return {"task": type(self.process).__name__, **known, **plain, "made_by": made_by}
 
 
-def _numbers(belief: ExactBelief) -> Tensor:
-    """Return what determines the last of a sequence's beliefs, `(O,)`."""
-    if isinstance(belief, CategoricalBelief):
+def _parameters(belief: ExactBelief) -> Tensor:
+    """Return the parameters of the last belief of a sequence, `(O,)`."""
+    if isinstance(belief, FiniteBelief):
         return belief.mean[0, -1]  # (S,)
     if not isinstance(belief, GaussianMixtureBelief):
         raise ForbesError(
-            f"shows: the exact belief is a {type(belief).__name__} of too many numbers, expected finite states or "
+            f"shows: the exact belief is a {type(belief).__name__} with too many parameters, expected finite states or "
             "Gaussians. Choose observation"
         )
     std = belief.covariance[-1].diagonal().sqrt()  # (D,)

@@ -1,8 +1,8 @@
-"""Which OpenGL backend renders on this machine: tried in a process of its own, since a broken one hangs or crashes.
+"""Find an OpenGL backend that renders. Backends are probed in a separate process, since broken ones hang or crash.
 
-MuJoCo reads the backend from `MUJOCO_GL` when it is first imported. Left to itself on a machine without a display,
-dm_control takes GLFW and dies at the first frame. Here the user's `MUJOCO_GL` counts; without it, the first of EGL (a
-GPU, or Mesa on the processor) and OSMesa (the processor) that renders.
+MuJoCo reads the backend from `MUJOCO_GL` when it is first imported. By default, on a machine without a display,
+dm_control uses GLFW and dies at the first frame. Here `MUJOCO_GL` is used if it is set, otherwise the first of EGL
+(GPU, or Mesa on the CPU) and OSMesa (CPU) that renders.
 """
 
 import json
@@ -19,7 +19,7 @@ __all__ = ["BACKENDS", "Probe", "choose_backend", "probe_backend"]
 
 BACKENDS = ("egl", "osmesa")
 TIME_LIMIT = 60.0
-"""Seconds for import, first frame and a few more; it takes 3 on an idle machine. A broken driver hangs for ever."""
+"""Timeout in seconds for import and a few frames, which take 3 s on an idle machine. A broken driver hangs forever."""
 
 _INSTALL = {
     "egl": "apt-get install libegl1 libgl1-mesa-dri; in a container with a GPU, NVIDIA_DRIVER_CAPABILITIES=all",
@@ -29,28 +29,28 @@ _PROGRAM = "import sys; from forbes.envs.dm_control import measure; measure(sys.
 
 
 class Probe(NamedTuple):
-    """What became of a backend."""
+    """The result of probing a backend."""
 
     backend: str
     renderer: str = ""
-    """GL_RENDERER: which device or software draws; llvmpipe is the processor."""
+    """GL_RENDERER, the device or software that renders; llvmpipe is the CPU."""
     frames_per_second: float = 0.0
-    """Of 64 x 64 pixels of a cartpole, physics included."""
+    """Speed for a cartpole with 64 x 64 pixels, including physics."""
     problem: str = ""
-    """Why it does not render; empty where it does."""
+    """Why it does not render; empty if it does."""
 
     @property
     def remedy(self) -> str:
-        """What to do; empty where all is well."""
+        """What to do; empty if there is no problem."""
         if self.problem:
             return _INSTALL.get(self.backend, "unset MUJOCO_GL")
         if "llvmpipe" in self.renderer and self.backend == "egl" and shutil.which("nvidia-smi"):
-            return "the GPU does not draw: give the container NVIDIA_DRIVER_CAPABILITIES=all"
+            return "the GPU does not render: set NVIDIA_DRIVER_CAPABILITIES=all for the container"
         return ""
 
 
 def probe_backend(backend: str, timeout: float = TIME_LIMIT) -> Probe:
-    """Render a few frames with a backend in a process of its own, which may hang or crash."""
+    """Render a few frames with a backend in a separate process, which may hang or crash."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", _PROGRAM, backend],
@@ -70,10 +70,10 @@ def probe_backend(backend: str, timeout: float = TIME_LIMIT) -> Probe:
 
 @lru_cache(maxsize=1)
 def choose_backend() -> Probe:
-    """Return the backend of `MUJOCO_GL`, else the first that renders; each process asks once, an environment's too.
+    """Return the backend of `MUJOCO_GL`, or the first that renders. The result is cached per process.
 
     Raises:
-        ForbesError: when none renders.
+        ForbesError: if no backend renders.
     """
     asked = os.environ.get("MUJOCO_GL")
     probes = []
@@ -82,7 +82,7 @@ def choose_backend() -> Probe:
         if not probes[-1].problem:
             return probes[-1]
     problems = "; ".join(f"{probe.backend}: {probe.problem}" for probe in probes)
-    failure = f"MUJOCO_GL={asked} gives no picture" if asked else "no backend gives a picture"
+    failure = f"MUJOCO_GL={asked} does not render" if asked else "no backend renders"
     raise ForbesError(
-        f"rendering: {failure} ({problems}). `forbes doctor` has the remedy; vectors need no rendering: --no-pixels"
+        f"rendering: {failure} ({problems}). Run `forbes doctor` for a remedy, or observe vectors with --no-pixels"
     )

@@ -1,4 +1,4 @@
-"""From the name of a task to its environment."""
+"""Find the environment of a task by name."""
 
 import difflib
 import inspect
@@ -20,18 +20,18 @@ __all__ = ["TASKS", "find_environment"]
 
 _GYMNASIUM = "gymnasium:"
 _HORIZONS = {"mountain_hike": 75, "multi_start_hike": 75, "t_maze": 30, "tiger": 30}
-"""Steps of an episode: those of DVRL, of DPFRL, 3 L as in belief-rnn; the tiger's is ours."""
+"""Steps per episode as in DVRL, in DPFRL, 3 L as in belief-rnn; that of the tiger is our choice."""
 
 TASKS = f"""\
 {", ".join(_HORIZONS)}: processes with an exact belief
-{_GYMNASIUM}ID: any environment of Gymnasium; of a package that registers its own, with the package's name:
-  {_GYMNASIUM}minigrid:MiniGrid-Empty-5x5-v0; of a module of your own with --allow-module MODULE, too
-CLASS: an Environment of your own, of a module named by --allow-module
-anything else is a task of the DeepMind Control Suite, domain_task: cartpole_swingup, ball_in_cup_catch, walker_walk"""
+{_GYMNASIUM}ID: any environment of Gymnasium; for a package that registers its own, with the package's name:
+  {_GYMNASIUM}minigrid:MiniGrid-Empty-5x5-v0; for a module of your own, also with --allow-module MODULE
+CLASS: an Environment of your own, in a module named by --allow-module
+other: a task of the DeepMind Control Suite as domain_task: cartpole_swingup, ball_in_cup_catch, walker_walk"""
 
 
 def _open_process(task: str, shows: "Shown" = "observation") -> Environment:
-    """Build a known process where it is used: tensors do not travel, and only here is torch imported."""
+    """Build the environment of a known process in its own process, so that torch is imported only there."""
     from forbes import pomdps
     from forbes.envs.known_process import KnownProcess
 
@@ -47,54 +47,53 @@ def _open_process(task: str, shows: "Shown" = "observation") -> Environment:
 _NAMED: dict[str, Callable[..., Environment]] = {
     **{name: partial(_open_process, name) for name in _HORIZONS},
 }
-"""Environments of this package that have a name of their own."""
+"""Environments of this package by name."""
 
 
 def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
-    """Return what makes the environment of a task; it can be sent to another process.
+    """Return a picklable function that makes the environment of a task.
 
     Args:
-        task: as `TASKS` says.
-        options: of the environment's constructor.
+        task: name of the task, one of those in `TASKS`.
+        options: arguments of the environment's constructor.
 
     Raises:
-        ForbesError: where no environment can be meant, it has no such option, or it is of a module of Gymnasium's
-            that nobody has allowed.
+        ForbesError: if there is no such task or option, or the task would import a module that is not allowed.
 
     Example:
         >>> make = forbes.find_environment("tiger")
         >>> make().reset(seed=0).observation.shape
         (2,)
     """
-    own = {kind.__name__: kind for kind in _descendants(Environment) if not kind.__module__.startswith("forbes.")}
+    external = {kind.__name__: kind for kind in _descendants(Environment) if not kind.__module__.startswith("forbes.")}
     make: Callable[..., Environment]
-    if task in own:
-        make = own[task]
+    if task in external:
+        make = external[task]
     elif task in _NAMED:
         make = _NAMED[task]
     elif task.startswith(_GYMNASIUM):
         _require_known_module(task)
         make = partial(Gymnasium, task.removeprefix(_GYMNASIUM))
-    elif near := difflib.get_close_matches(task, [*own, *_NAMED], n=1, cutoff=0.8):
+    elif near := difflib.get_close_matches(task, [*external, *_NAMED], n=1, cutoff=0.8):
         raise ForbesError(f"{task}: no such task. Did you mean {near[0]}?")
-    elif "_" not in task:  # which every DOMAIN_TASK of DeepMind Control has
+    elif "_" not in task:  # every DOMAIN_TASK of DeepMind Control has one
         raise ForbesError(
-            f"{task}: no such task. `forbes data collect --help` says what there is; an environment of your own needs "
+            f"{task}: no such task. `forbes data collect --help` lists the tasks; an environment of your own needs "
             "--allow-module MODULE"
         )
     else:
         make = partial(DeepMindControl, task)
     unknown = options.keys() - inspect.signature(make).parameters.keys()
     if unknown:
-        raise ForbesError(f"{task}: its environment has no option {min(unknown)}. Leave it out")
+        raise ForbesError(f"{task}: its environment has no option {min(unknown)}. Remove it")
     return partial(make, **options)
 
 
 def _require_known_module(task: str) -> None:
-    """Refuse `gymnasium:MODULE:ID` where Gymnasium would import a module that only the task names.
+    """Refuse `gymnasium:MODULE:ID` if Gymnasium would import an unknown module.
 
-    A configuration may come from anywhere, and to import a module is to run it. Known are what is imported already, as
-    a module of --allow-module is, and the packages that register environments by an entry point.
+    A configuration may come from an untrusted source, and importing a module runs it. Known modules are those imported
+    already, e.g. by --allow-module, and packages that register environments by an entry point.
     """
     module = task.removeprefix(_GYMNASIUM).rpartition(":")[0]
     registering = {entry.module.partition(".")[0] for entry in entry_points(group="gymnasium.envs")}

@@ -1,7 +1,7 @@
-"""A process that owns an environment, so that a simulator that hangs, dies or raises takes nothing with it.
+"""Run an environment in a worker process, so that a simulator that hangs, dies or raises does not affect the parent.
 
-A renderer in the process that trains on a GPU can hang it. Numbers travel as numpy, and torch is not imported there
-unless the environment does it.
+A renderer in a process that trains on a GPU can hang it. The worker exchanges numpy arrays and does not import torch,
+unless the environment does.
 """
 
 import atexit
@@ -26,19 +26,19 @@ from forbes.errors import ForbesError
 __all__ = ["BrokenEnvironmentError", "EnvironmentProcess"]
 
 START_LIMIT = 180.0
-"""Seconds to import and build an environment; two tries of a renderer, of 60 each, among them."""
-_UNGUARDED = '. It reads the script that started it anew: keep its commands under `if __name__ == "__main__":`'
+"""Timeout in seconds to import and build an environment, including two probes of a renderer, 60 s each."""
+_UNGUARDED = '. The process re-imports the script that started it: guard its code with `if __name__ == "__main__":`'
 
 
-_IN_A_MODULE = "Define it at the top of a module file, and import it from there"
+_IN_A_MODULE = "Define it at the top level of a module file, and import it from there"
 
 
 class BrokenEnvironmentError(ForbesError):
-    """An environment has hung, died, raised or given what is no number: its episode is lost, the next may go well."""
+    """An environment hung, died, raised an error or returned invalid values. Its episode is lost; a reset may help."""
 
 
 class _Facts(NamedTuple):
-    """What the process says of its environment once it is built."""
+    """Attributes of the environment, sent by the worker once it is built."""
 
     observation_shape: tuple[int, ...]
     action_dim: int
@@ -48,27 +48,27 @@ class _Facts(NamedTuple):
 
 
 class _Report(NamedTuple):
-    """What the process says before it ends."""
+    """Error sent by the worker before it exits."""
 
     sentence: str
     details: str
     refused: bool
-    """True for an error the user can mend: to try again is no use."""
+    """True for an error that the user must fix, so that there is no point in trying again."""
 
 
 class EnvironmentProcess(Environment):
-    """An environment in a process of its own, which is started anew for the reset that follows a failure.
+    """An environment in a worker process, which is restarted for the reset after a failure.
 
-    Close it, or use it in a `with` statement. The process ends with its parent, whatever ends that.
+    Close it, or use it in a `with` statement. The worker always ends with its parent.
 
     Args:
-        make: makes the environment; what `find_environment` gives, a class, or a `functools.partial` of one.
-        timeout: seconds in which a reset or a step must be answered.
-        time_limit: steps after which an episode that has not ended by itself is truncated, so that each has an end.
+        make: function that makes the environment: the result of `find_environment`, a class, or a `functools.partial`.
+        timeout: seconds within which a reset or step must be answered.
+        time_limit: number of steps after which an episode is truncated.
 
     Raises:
-        BrokenEnvironmentError: where the environment cannot be built.
-        ForbesError: where it says why, in a sentence, or another process cannot import what makes it.
+        BrokenEnvironmentError: if the environment cannot be built.
+        ForbesError: if the environment raises one when it is built, or `make` cannot be sent to another process.
     """
 
     def __init__(self, make: Callable[[], Environment], timeout: float = 60.0, time_limit: int = TIME_LIMIT) -> None:
@@ -78,16 +78,16 @@ class EnvironmentProcess(Environment):
         self._start()
 
     def reset(self, seed: int) -> Step:
-        """See `Environment.reset`; raises BrokenEnvironmentError."""
+        """Start the episode of a seed. Raises a BrokenEnvironmentError on a failure."""
         if self._process is None:
             self._start()
         self._steps = 0
         return self._ask("reset", seed)
 
     def step(self, action: NDArray[np.float32]) -> Step:
-        """See `Environment.step`; raises BrokenEnvironmentError, after which there must be a reset."""
+        """Apply an action, float32 `(A,)`. Raises a BrokenEnvironmentError on a failure; then call `reset`."""
         if self._process is None:
-            raise BrokenEnvironmentError(f"{self._name}: the episode is broken, expected a reset before the next step")
+            raise BrokenEnvironmentError(f"{self._name}: the episode failed, expected a reset before the next step")
         step = self._ask("step", action)
         self._steps += 1
         if self._steps >= self._time_limit and not step.terminated:
@@ -95,12 +95,12 @@ class EnvironmentProcess(Environment):
         return step
 
     def describe(self) -> dict[str, Any]:
-        """See `Environment.describe`; with the limit of steps, its own or the environment's, whichever comes first."""
+        """Return the environment's description with the time limit that applies: its own, or the environment's."""
         own = self._description.get("time_limit", self._time_limit)
         return self._description | {"time_limit": min(own, self._time_limit)}
 
     def close(self) -> None:
-        """End the process, however busy it is."""
+        """Kill the process."""
         if self._process is not None:
             self._process.kill()
             self._process.join()
@@ -116,29 +116,29 @@ class EnvironmentProcess(Environment):
 
     @property
     def _name(self) -> str:
-        """What errors call it: its task or, until it is built, what builds it."""
+        """Name for error messages: the task, or before it is built, the name of `make`."""
         built = hasattr(self, "_description")
         return str(self._description["task"] if built else getattr(self.make, "func", self.make).__name__)
 
     def _start(self) -> None:
         self._process, self._connection = start_child(_serve, self.make)
-        atexit.register(self.close)  # multiprocessing would wait for it
+        atexit.register(self.close)  # multiprocessing would wait for the process
         facts: _Facts = self._receive("start", START_LIMIT)
         self.observation_shape, self.action_dim, self.discrete, self.action_repeat, self._description = facts
 
     def _ask(self, method: str, argument: Any) -> Step:
         try:
             self._connection.send((method, argument))
-        except OSError:  # it has died since its last answer; the pipe still holds why, if it could say so
+        except OSError:  # the process has died; the pipe may still contain its error, which `_receive` reads
             pass
         step: Step = self._receive(method, self._timeout)
         return step
 
     def _receive(self, method: str, timeout: float) -> Any:
-        """Wait for an answer; whatever comes instead ends the process."""
+        """Wait for an answer; on any error, end the process."""
         try:
             return self._answer(method, timeout)
-        except BaseException:  # an interrupt, too: the answer it left would be taken for the next one's
+        except BaseException:  # also after an interrupt, whose pending answer would be mistaken for the next one
             self.close()
             raise
 
@@ -148,11 +148,11 @@ class EnvironmentProcess(Environment):
             if not self._connection.poll(timeout):
                 raise BrokenEnvironmentError(f"{self._name}: it hangs, no answer to {method} within {timeout:g} s")
             answer = self._connection.recv()
-        except (EOFError, OSError) as error:  # before an answer, or within one
+        except (EOFError, OSError) as error:  # before or within an answer
             self._process.join(timeout)
             status = self._process.exitcode
             raise BrokenEnvironmentError(
-                f"{self._name}: its process has died in {method}, exit code {status}"
+                f"{self._name}: its process died in {method}, exit code {status}"
                 + (_UNGUARDED if method == "start" else "")
             ) from error
         if isinstance(answer, _Report):
@@ -164,35 +164,35 @@ class EnvironmentProcess(Environment):
 
 
 class _Importable(pickle.Pickler):
-    """Finds what another process could not import: the classes and functions of a `__main__` without a file."""
+    """Refuses classes and functions of a `__main__` without a file, which another process could not import."""
 
     def reducer_override(self, value: Any) -> Any:
-        """Raise a ForbesError for one of them; leave all else to pickle."""
+        """Raise a ForbesError for such a class or function; leave everything else to pickle."""
         if isinstance(value, type | FunctionType) and value.__module__ == "__main__":
             raise ForbesError(
-                f"{value.__qualname__}: it is defined in a notebook or on standard input, which the process of an "
-                f"environment cannot import. {_IN_A_MODULE}"
+                f"{value.__qualname__}: it is defined in a notebook or on standard input, which the worker process of "
+                f"an environment cannot import. {_IN_A_MODULE}"
             )
         return NotImplemented
 
 
 def _require_importable(make: Callable[[], Environment]) -> None:
-    """Raise a ForbesError where what makes an environment cannot be sent to another process."""
+    """Raise a ForbesError if `make` cannot be sent to another process."""
     name = getattr(make, "__qualname__", type(make).__name__)
     file = getattr(sys.modules["__main__"], "__file__", "")
     try:
         (pickle.Pickler if os.path.isfile(file) else _Importable)(io.BytesIO()).dump(make)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:  # all three are what pickle raises
+    except (pickle.PicklingError, AttributeError, TypeError) as error:  # pickle raises any of these
         raise ForbesError(f"{name}: it cannot be sent to another process ({error}). {_IN_A_MODULE}") from error
-    if file and not os.path.isfile(file):  # "<stdin>", which a spawned process takes for a file
+    if file and not os.path.isfile(file):  # "<stdin>", which a spawned process treats as a file
         raise ForbesError(
-            f"{name}: commands on standard input cannot start the process of an environment, which reads them again. "
-            "Write them to a file"
+            f"{name}: code on standard input cannot start the worker process of an environment, which re-imports it. "
+            "Write it to a file"
         )
 
 
 def _serve(connection: Connection, make: Callable[[], Environment]) -> None:
-    """Run in the process: build the environment and answer until the parent is gone or something is wrong."""
+    """Main function of the worker: build the environment and answer until the parent exits or an error occurs."""
     try:
         environment = make()
         check_environment(environment)

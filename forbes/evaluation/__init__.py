@@ -1,4 +1,4 @@
-"""Evaluation: bounds, proper scores and predictions of finished models, by one convention (DESIGN §8)."""
+"""Evaluation of trained models: likelihood bounds, proper scores and predictions, all by one convention."""
 
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.predictions import Completions, complete, filter, imagine

@@ -1,8 +1,7 @@
-"""What agents earn: whole episodes without exploration, each agent in the same ones."""
+"""Evaluate agents: their returns in whole episodes without exploration, the same episodes for every agent."""
 
 import sys
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,9 +17,9 @@ from forbes.errors import ForbesError
 from forbes.evaluation.agent_beliefs import exact_variance, learned_variance, prior_and_posterior, uncertainty
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.record import require_readable, write_record
-from forbes.evaluation.reward_prediction import SAMPLES, STEPS_AHEAD, explained, predict_rewards
+from forbes.evaluation.reward_prediction import SAMPLES, predict_rewards, r2_by_steps_ahead
 from forbes.pomdps import Process
-from forbes.runs.provenance import commit
+from forbes.runs.provenance import origin
 from forbes.seeding import derive_seed
 from forbes.training.acting import WorldModelAgent, play_measured
 from forbes.training.loading import load_run, loaded_agent
@@ -30,28 +29,42 @@ __all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", 
 DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
 REWARD = "reward_uncertainty"
 _APART = ("made_by", "shows", "observation_shape")
-"""In what environments of one task may differ: an agent that is shown the exact belief earns the same rewards."""
+"""Fields in which environments of one task may differ: the rewards do not depend on what the agent is shown."""
+
+
+class EpisodeMeasures(NamedTuple):
+    """What is measured in one test episode of T actions."""
+
+    total_reward: float
+    """Undiscounted return."""
+    reward: Tensor
+    """Observed rewards, `(T,)`, float64."""
+    predicted: dict[int, Tensor]
+    """Predicted rewards by steps ahead, from `predict_rewards`."""
+    distance: Tensor | None
+    """KL of prior and posterior from a Gaussian, `(2,)`; None if s is discrete."""
+    variances: tuple[Tensor, Tensor] | None
+    """Variance of each reward under the learned and the exact belief, `(T,)` each; None if no exact belief is known."""
 
 
 class PlayedAgent(NamedTuple):
-    """A run and the episodes it was measured in."""
+    """A run and its results in the test episodes."""
 
     run: str
     agent: WorldModelAgent
     returns: Tensor
-    """Undiscounted, `(E,)`, float64."""
-    explained: list[Estimate | None]
-    """The share of the rewards' variance that the world model foretold, for each of `STEPS_AHEAD`."""
+    """Undiscounted return of each episode, `(E,)`, float64."""
+    r2: dict[int, Estimate | None]
+    """R² of the predicted rewards by steps ahead."""
     belief: dict[str, Estimate]
-    """What is said of the belief, by metric: `DISTANCES` from a Gaussian, where s is
-    continuous, and `REWARD`, where the exact belief is known."""
+    """Metrics of the belief: `DISTANCES` from a Gaussian if s is continuous, `REWARD` if the exact belief is known."""
     environment: dict[str, Any]
     checkpoint: str
-    """SHA-256 of the one that has played."""
+    """SHA-256 of the evaluated checkpoint."""
 
 
 def is_agent(run: str) -> bool:
-    """Tell whether a run folder holds an agent, which is measured by what it earns."""
+    """Return whether a run folder holds an agent, which is evaluated by its returns."""
     module, data = load_run(run)
     if isinstance(data.source, Experience):
         data.source.close()
@@ -63,19 +76,19 @@ def evaluate_agents(
 ) -> list[PlayedAgent]:
     """Let every agent play the same episodes, and record its returns.
 
-    Episode k of every run is reset with the same seed, none of which was used in a training. The action is the policy's
-    mode, or the plan, without noise.
+    Episode k is reset with the same seed for every run, and no such seed was used in training. Actions are the mode of
+    the policy, or the plan, without noise.
 
     Args:
         runs: run folders, and the folder for the record of each.
-        episodes: E, at least 2.
-        samples: K, trajectories of the belief that each action is chosen by; None for the agent's own.
-        seed: of the episodes.
-        device: of the models.
-        command: for the record.
+        episodes: number of episodes, E, at least 2.
+        samples: number of belief samples per action, K; None for the agent's own number.
+        seed: random seed for the episodes.
+        device: device of the models.
+        command: command line, for the record.
 
     Raises:
-        ForbesError: where a run is not an agent's, or its task is another than the first's.
+        ForbesError: if a run does not hold an agent, or its task differs from that of the first run.
     """
     if episodes < 2:
         raise ForbesError(f"--episodes {episodes}: a standard error needs at least 2. Choose more")
@@ -93,31 +106,42 @@ def evaluate_agents(
 def _play(
     run: str, agent: WorldModelAgent, environment: EnvironmentProcess, checkpoint: str, episodes: int, seed: int
 ) -> PlayedAgent:
-    returns, rewards, foretold = list[float](), list[Tensor](), list[list[Tensor]]()
-    process, variances, distances = _known_process(environment), list[tuple[Tensor, Tensor]](), list[Tensor]()
+    process = _known_process(environment)
+    measured: list[EpisodeMeasures] = []
     for number in _counted(run, episodes):
         episode = play_test_episode(agent, environment, seed, number)
-        returns.append(episode.total_reward)
-        rewards.append(torch.from_numpy(episode.reward[1:]).double())  # (T,)
-        draws = derive_seed(seed, "foresight", number)
-        foretold.append(predict_rewards(agent, episode, draws, f"{run}, test episode {number}"))
-        if (distance := prior_and_posterior(agent, episode, draws)) is not None:
-            distances.append(distance)
-        if process is not None:
-            variances.append((learned_variance(agent, episode, draws), exact_variance(process, episode, draws)))
-    total = torch.tensor(returns, dtype=torch.float64)  # (E,)
-    belief = dict[str, Estimate]()
+        name, of_samples = f"{run}, test episode {number}", derive_seed(seed, "foresight", number)
+        measured.append(_measure(agent, episode, process, of_samples, name))
+    returns = torch.tensor([episode.total_reward for episode in measured], dtype=torch.float64)  # (E,)
+    r2 = r2_by_steps_ahead([episode.predicted for episode in measured], [episode.reward for episode in measured])
+    distances = [episode.distance for episode in measured if episode.distance is not None]  # E x (2,), or none
+    variances = [episode.variances for episode in measured if episode.variances is not None]  # E x 2 x (T,), or none
+    belief: dict[str, Estimate] = {}
     if distances:
         belief |= zip(DISTANCES, map(Estimate.of, torch.stack(distances, 1)), strict=True)  # 2 x (E,)
     if variances:
         belief[REWARD] = uncertainty(*zip(*variances, strict=True))
-    return PlayedAgent(
-        run, agent, total, explained(foretold, rewards), belief, describe_environment(environment), checkpoint
+    return PlayedAgent(run, agent, returns, r2, belief, describe_environment(environment), checkpoint)
+
+
+def _measure(
+    agent: WorldModelAgent, episode: Episode, process: Process | None, seed: int, name: str
+) -> EpisodeMeasures:
+    """Measure one episode; `seed` is the random seed for samples of the beliefs, `name` is for error messages."""
+    variances = None
+    if process is not None:
+        variances = learned_variance(agent, episode, seed), exact_variance(process, episode, seed)
+    return EpisodeMeasures(
+        total_reward=episode.total_reward,
+        reward=torch.from_numpy(episode.reward[1:]).double(),
+        predicted=predict_rewards(agent, episode, seed, name),
+        distance=prior_and_posterior(agent, episode, seed),
+        variances=variances,
     )
 
 
 def _known_process(environment: EnvironmentProcess) -> Process | None:
-    """Return the process behind an environment that shows its observations, if its belief is known exactly."""
+    """Return the environment's process if it shows observations and its exact belief is known, else None."""
     if environment.describe().get("shows") != "observation":
         return None
     known = environment.make()
@@ -125,13 +149,7 @@ def _known_process(environment: EnvironmentProcess) -> Process | None:
 
 
 def _record(one: PlayedAgent, folder: Path, seed: int, command: str) -> None:
-    measured = {
-        "checkpoint": one.checkpoint,
-        "command": command,
-        "commit": commit(),
-        "seed": seed,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
+    measured = {"checkpoint": one.checkpoint, **origin(command, seed)}
     entry = {
         **Estimate.of(one.returns)._asdict(),
         "interval_95": bootstrap_interval(one.returns),
@@ -140,30 +158,30 @@ def _record(one: PlayedAgent, folder: Path, seed: int, command: str) -> None:
     }
     samples = one.agent.acting_samples
     tag = f"episodes={len(one.returns)}{'' if samples == 1 else f',K={samples}'}"
-    shares = {
-        f"reward_explained[ahead={distance},S={SAMPLES},{tag}]": share._asdict() | measured
-        for distance, share in zip(STEPS_AHEAD, one.explained, strict=True)
-        if share is not None
+    others = {
+        f"reward_explained[ahead={ahead},S={SAMPLES},{tag}]": r2._asdict() | measured
+        for ahead, r2 in one.r2.items()
+        if r2 is not None
     }
-    shares |= {f"{metric}[{tag}]": estimate._asdict() | measured for metric, estimate in one.belief.items()}
+    others |= {f"{metric}[{tag}]": estimate._asdict() | measured for metric, estimate in one.belief.items()}
     name = f"return[{tag}]"
-    write_record(folder, {name: entry | measured} | shares, {name: one.returns})
+    write_record(folder, {name: entry | measured} | others, {name: one.returns})
 
 
 def play_test_episode(agent: WorldModelAgent, environment: Environment, seed: int, number: int) -> Episode:
-    """Play an episode of a test, which was not in the training: for every agent, the same seed is the same episode."""
+    """Play a test episode, which was not used in training. The same seed gives every agent the same episode."""
     return play_measured(agent, environment, "test episode", seed, number)
 
 
 def _counted(run: str, episodes: int) -> Iterator[int]:
-    """Count, and say how far it is."""
+    """Yield the number of each episode, and print progress after it."""
     for number in range(episodes):
         yield number
         print(f"{run}: {number + 1}/{episodes} episodes", file=sys.stderr, flush=True)
 
 
 def _require_same_task(first: PlayedAgent, run: str, task: dict[str, Any]) -> None:
-    ours, theirs = ({k: v for k, v in each.items() if k not in _APART} for each in (first.environment, task))
+    ours, theirs = ({k: v for k, v in fields.items() if k not in _APART} for fields in (first.environment, task))
     if ours != theirs:
         raise ForbesError(
             f"{run}: its task is {theirs['task']} ({theirs}), that of {first.run} is {ours['task']} ({ours}), "

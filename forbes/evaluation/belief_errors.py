@@ -1,4 +1,4 @@
-r"""How far a belief is from the exact one, step by step: divergences, a proper score, width, and the mass of each mode.
+r"""Errors of a belief relative to the exact one at each step: divergences, a proper score, width, and mode masses.
 
 .. math::
 
@@ -6,9 +6,9 @@ r"""How far a belief is from the exact one, step by step: divergences, a proper 
     \frac{\operatorname{tr} \operatorname{Var} q}{\operatorname{tr} \operatorname{Var} p}, \quad
     \frac12 \sum_k |q(R_k) - p(R_k)|
 
-p is the exact belief given o_1:t, and q the other. The first is large where q misses a mode, the second where q has
-mass that should not be there; the third, of the true state, has the first as its mean. R_k are the states nearest to
-the k-th of some fixed points, one for each mode, so they are the same for every belief and at every step.
+p is the exact belief given o_1:t, and q the other belief. The forward KL is large if q misses a mode, the reverse KL if
+q has mass where p has none. The third, a regret at the true state, has the forward KL as its mean. R_k are the states
+nearest to the k-th of some fixed points, one per mode, so the regions are the same for every belief and step.
 """
 
 from typing import NamedTuple, Protocol
@@ -32,28 +32,28 @@ from forbes.pomdps.mountain_hike import STARTS
 __all__ = ["ERRORS", "Belief", "belief_errors", "mode_centres", "moment_matched"]
 
 ERRORS = ("forward_kl", "reverse_kl", "state_nll_regret", "variance_ratio", "mode_mass_error")
-"""What `belief_errors` gives; all but the ratio are 0 for the exact belief, the ratio is 1."""
+"""Errors returned by `belief_errors`. For the exact belief the ratio is 1 and all others are 0."""
 
 
 class Belief(Protocol):
-    """What is compared: a distribution of s_t for every sequence and step, such as any `ExactBelief`."""
+    """A distribution of s_t for every sequence and step, such as any `ExactBelief`."""
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw s_t, `(count, B, T, D)`."""
+        """Sample s_t, `(count, B, T, D)`."""
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return its log-density in nats: `(..., B, T, D)` to `(..., B, T)`."""
+        """Return the log-density in nats, `(..., B, T, D)` to `(..., B, T)`."""
 
 
 class _Nodes(NamedTuple):
     """Points with the weights that make a sum over them an expectation under either belief."""
 
     point: Tensor
-    """`(N, B, T, D)`."""
+    """States, `(N, B, T, D)`."""
     log_ratio: Tensor
     """log p - log q, `(N, B, T)`."""
     weight: Tensor
-    """Of p and of q, `(2, N, B, T)`."""
+    """Weights for p and for q, `(2, N, B, T)`."""
 
 
 def belief_errors(
@@ -66,17 +66,16 @@ def belief_errors(
 ) -> Increments:
     """Compare a belief with the exact one.
 
-    Where the exact belief is a grid, every expectation is a sum over its cells: without noise, and exact as long as the
-    other belief is no narrower than a cell. That one is taken given that the state is on the grid. Elsewhere both are
-    sampled.
+    If the exact belief is a grid, expectations are sums over its cells: without noise, and exact as long as the other
+    belief is no narrower than a cell. The other belief is then conditioned on the grid. Otherwise both are sampled.
 
     Args:
-        exact: p, `(B, T)` of them, in float64.
-        belief: q, likewise.
-        state: the true s_t, `(B, T, D)`.
-        modes: a point in each mode, `(K, D)`; None where there is one mode, and then no error of its mass.
-        samples: of each belief.
-        generator: draws them.
+        exact: exact beliefs p, batch shape `(B, T)`, float64.
+        belief: beliefs q to compare, batch shape `(B, T)`.
+        state: true states s_t, `(B, T, D)`.
+        modes: one point per mode, `(K, D)`; None for a single mode, which has no mode-mass error.
+        samples: number of samples of each belief.
+        generator: random generator for the samples.
 
     Returns:
         `ERRORS` by name, `(B, T)` each; KLs and regret in nats.
@@ -98,10 +97,10 @@ def belief_errors(
 
 
 def mode_centres(process: Process) -> Tensor | None:
-    """Return a point in each mode that a belief of the process can have, `(K, D)`, None where it has one.
+    """Return one point for each possible mode of the process's belief, `(K, D)`, or None if there is one mode.
 
-    The signs that an even sensor cannot see, the two sides of the light, and the corners where a hiker may have started
-    and, with steps of at most 0.05, for long still is.
+    The modes are the two signs that an even sensor cannot distinguish, the two sides of the light, and the possible
+    start corners of a hiker, who stays near them for long with steps of at most 0.05.
     """
     if isinstance(process, MirrorSensor | Ungm):
         return torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
@@ -113,25 +112,25 @@ def mode_centres(process: Process) -> Tensor | None:
 
 
 def moment_matched(exact: ExactBelief) -> GaussianMixtureBelief:
-    """Return the diagonal Gaussian with the same mean and variance, which has the least forward KL of all of them."""
+    """Return the diagonal Gaussian with the same mean and variance, which minimises the forward KL among them."""
     mean = exact.mean.unsqueeze(-2)  # (B, T, 1, D)
     return GaussianMixtureBelief(mean.new_zeros(mean.shape[:-1]), mean, exact.variance.diag_embed())
 
 
 def _cells(exact: GridBelief, belief: Belief) -> _Nodes:
-    """Take the cells of a grid, by the midpoint rule."""
+    """Return the cells of a grid as nodes (midpoint rule)."""
     point = exact.centres.expand(exact.log_mass.shape).movedim(-1, 0).unsqueeze(-1)  # (G, B, T, 1)
     log_exact, log_belief = exact.log_prob(point), belief.log_prob(point)  # 2 x (G, B, T)
     return _Nodes(point, log_exact - log_belief, torch.stack((log_exact, log_belief)).softmax(1))
 
 
 def _draws(exact: ExactBelief, belief: Belief, samples: int, generator: torch.Generator) -> _Nodes:
-    r"""Draw n points from each belief, and take all of them for both.
+    r"""Sample n points from each belief, and use all 2n of them for both.
 
     .. math:: E_p f \approx \frac1n \sum_{i=1}^{2n} \frac{p(s_i)}{p(s_i) + q(s_i)}\, f(s_i)
 
-    is unbiased, and no weight exceeds 1/n (the balance heuristic of Veach and Guibas, 1995). The noise of what p and q
-    have in common is the same for both, so two equal beliefs differ by nothing.
+    is unbiased, and no weight exceeds 1/n (the balance heuristic of Veach and Guibas, 1995). Both expectations share
+    their noise, so the errors of two equal beliefs are exactly 0.
     """
     point = torch.cat((exact.sample(samples, generator), belief.sample(samples, generator)))  # (2 n, B, T, D)
     log_density = torch.stack((exact.log_prob(point), belief.log_prob(point)))  # (2, 2 n, B, T)
@@ -139,12 +138,12 @@ def _draws(exact: ExactBelief, belief: Belief, samples: int, generator: torch.Ge
 
 
 def _expectation(weight: Tensor, values: Tensor) -> Tensor:
-    """Sum over points, `(N, *)` to `(*)`; where the weight is 0 the value may be infinite."""
+    """Return the weighted sum over points, `(N, *)` to `(*)`. Values with weight 0 may be infinite."""
     return (weight * values).where(weight > 0, 0.0).sum(0)
 
 
 def _variance(point: Tensor, weight: Tensor) -> Tensor:
     """Return the trace of the variance, `(N, *, D)` and `(N, *)` to `(*)`."""
-    share = (weight / weight.sum(0)).unsqueeze(-1)  # (N, *, 1)
-    mean = (share * point).sum(0)  # (*, D)
-    return (share * (point - mean).square()).sum((0, -1))
+    probability = (weight / weight.sum(0)).unsqueeze(-1)  # (N, *, 1)
+    mean = (probability * point).sum(0)  # (*, D)
+    return (probability * (point - mean).square()).sum((0, -1))

@@ -1,7 +1,7 @@
-"""Families of models side by side: what `forbes evaluate` has recorded of their runs, over seeds and paired.
+"""Compare families of models by the recorded results of `forbes evaluate`, over seeds and paired.
 
-A family is a configuration, trained under several seeds. Its score is the mean over its runs; the spread over runs says
-what another seed would change. A difference of two families is taken per seed, over the same sequences.
+A family is a configuration trained with several seeds. Its score is the mean over its runs; their spread shows the
+effect of the seed. The difference of two families is taken per seed, over the same sequences.
 """
 
 import math
@@ -32,31 +32,31 @@ class Family(NamedTuple):
     runs: Mapping[int, str]
     """Run folders by seed."""
     parameters: int
-    """Of each of its models."""
+    """Number of parameters of each model."""
     lacks: Collection[str] = ()
-    """Metrics that its models do not have."""
+    """Metrics that the models do not have."""
 
 
 class Comparison(NamedTuple):
-    """What was measured, as tables; nats per sequence."""
+    """The scores of all families as tables, in nats per sequence."""
 
     scores: pd.DataFrame
-    """A row for each family, metric and seed: mean, standard_error (over sequences), per_step, parameters, run; the
-    numbers are empty where the family does not have the metric."""
+    """One row per family, metric and seed: mean, standard_error (over sequences), per_step, parameters, run. The
+    scores are empty if the family does not have the metric."""
     differences: pd.DataFrame
-    """A row for each family but the first, score and seed: mean and standard_error of family - first, paired, where
-    both have it."""
+    """One row per family but the first, score and seed: mean and standard_error of the paired difference family -
+    first, for the scores that both have."""
     curves: dict[str, dict[str, list[float]]]
-    """By metric and family that has it, the mean of each step over sequences and seeds; of the `degradation` too."""
+    """Mean at each step over sequences and seeds, by metric and family; includes `degradation`."""
     references: dict[str, dict[str, float]]
-    """By score and name, what models without a belief have on the same sequences."""
+    """Scores of models without a belief on the same sequences, by score and name."""
 
 
 def compare(families: Sequence[Family], metrics: Sequence[str]) -> Comparison:
-    """Collect what is recorded of runs that were measured on the same sequences.
+    """Collect the recorded results of runs that were evaluated on the same sequences.
 
     Raises:
-        ForbesError: where a run lacks a metric, or was measured on other sequences than the first.
+        ForbesError: if a run lacks a metric, or was evaluated on other sequences than the first.
     """
     rows, curves = [], {}
     references: dict[str, dict[str, float]] = {}
@@ -85,15 +85,15 @@ def _entries(family: Family, metric: str) -> list[dict[str, Any]]:
     for run in family.runs.values():
         record = read_record(run)
         if metric not in record:
-            raise ForbesError(f"{run}: evaluation.json has no {metric}. Measure it: forbes evaluate {run}")
+            raise ForbesError(f"{run}: evaluation.json has no {metric}. Run: forbes evaluate {run}")
         if lacking := [field for field in _NEEDED if field not in record[metric]]:
-            raise ForbesError(f"{run}: the {metric} of evaluation.json has no {lacking[0]}. Measure it again")
+            raise ForbesError(f"{run}: the {metric} of evaluation.json has no {lacking[0]}. Evaluate the run again")
         entries.append(record[metric])
     return entries
 
 
 def _blank(other: dict[str, Any]) -> dict[str, Any]:
-    """Return the entry of a metric that a run's model does not have, beside that of another."""
+    """Return an empty entry for a metric that the model does not have, modelled on the entry of another run."""
     return other | {"mean": math.nan, "standard_error": math.nan, "per_step": {"mean": math.nan}}
 
 
@@ -131,7 +131,7 @@ def _paired(family: Family, first: Family, metric: str) -> list[dict[str, Any]]:
         if one.shape != other.shape:
             raise ForbesError(
                 f"{family.runs[seed]}: evaluation.npz has {len(one)} sequences of {metric}, {first.runs[seed]} "
-                f"{len(other)}, expected the same. Measure both again"
+                f"{len(other)}, expected the same. Evaluate both again"
             )
         values = one - other  # (N,)
         difference = Estimate.of(torch.from_numpy(values))._asdict()
@@ -143,12 +143,12 @@ def _array(run: str, metric: str) -> NDArray[np.float64]:
     """Return the score of each sequence, `(N,)`."""
     arrays = read_arrays(run)
     if metric not in arrays:
-        raise ForbesError(f"{run}: evaluation.npz has no {metric}. Measure it: forbes evaluate {run}")
+        raise ForbesError(f"{run}: evaluation.npz has no {metric}. Run: forbes evaluate {run}")
     return arrays[metric]
 
 
 def markdown(comparison: Comparison, families: Sequence[Family]) -> str:
-    """Write the comparison as two tables: scores, and differences to the first family."""
+    """Return the comparison as Markdown tables: scores, references, differences to the first family, degradation."""
     scores = comparison.scores.set_index(["metric", "family"]).sort_index()
     metrics = comparison.scores["metric"].unique()
     names = [family.name for family in families]
@@ -178,14 +178,14 @@ def markdown(comparison: Comparison, families: Sequence[Family]) -> str:
     for metric, curves in comparison.curves.items():
         if score_of(metric) == "degradation":
             rows = at_horizons(metric, curves)
-            lines += ["", f"`{metric}`: nats a prediction loses so many steps after the last one seen.", ""]
+            lines += ["", f"`{metric}`: nats that a prediction loses, by steps after the last observation.", ""]
             lines += _table(["steps", *map(str, next(iter(rows.values())))], [])
             lines += _rows([[name, *(f"{loss:.2f}" for loss in row.values())] for name, row in rows.items()])
     return "\n".join(lines) + "\n"
 
 
 def _below(values: Sequence[float], references: Mapping[str, float]) -> str:
-    """Name the lowest reference above the mean of some values."""
+    """Return " < name" of the lowest reference above the mean of the values, or nothing."""
     name = lowest_above(statistics.fmean(values), references)
     return f" < {name}" if name else ""
 

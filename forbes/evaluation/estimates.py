@@ -1,4 +1,4 @@
-"""Means over sequences with their errors: of one model, and paired between two (DESIGN §8)."""
+"""Means over sequences with their standard errors."""
 
 import math
 from typing import NamedTuple
@@ -26,11 +26,11 @@ class Estimate(NamedTuple):
 
     @classmethod
     def per_step(cls, values: Tensor, steps: Tensor) -> "Estimate":
-        r"""Average over all steps of all sequences: :math:`\sum_i v_i / \sum_i T_i`, with the error of a ratio.
+        r"""Average over all steps of all sequences, :math:`\sum_i v_i / \sum_i T_i`, with the error of a ratio.
 
         Args:
-            values: of each sequence, summed over its steps, `(N,)`.
-            steps: :math:`T_i` without padding, `(N,)`.
+            values: sum :math:`v_i` over the steps of each sequence, `(N,)`.
+            steps: number of steps without padding, :math:`T_i`, `(N,)`.
         """
         mean = values.sum() / steps.sum()
         residual = (values - mean * steps) / steps.double().mean()  # (N,)
@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
 
 
 def bootstrap_interval(values: Tensor, level: float = 0.95, seed: int = 0) -> tuple[float, float]:
-    """Return the percentile bootstrap interval of the mean over sequences, `(N,)`: it need not be symmetric."""
+    """Return the percentile bootstrap interval of the mean of `values`, `(N,)`, which need not be symmetric."""
     draw = generator(seed, "bootstrap", len(values))
     index = torch.randint(len(values), (_RESAMPLES, len(values)), generator=draw)  # (R, N)
     tail = (1 - level) / 2

@@ -1,7 +1,7 @@
-"""Metrics of runs that were measured on the same sequences: their names, differences, and degradation.
+"""Metrics of runs evaluated on the same sequences: their names, differences, and degradation.
 
-**Degradation** is how much worse a prediction becomes with the horizon. Of step t > c the closed loop has seen o_1 to
-o_{t-1} (`pll`), the open loop o_1 to o_c (`open_loop_marginal`). The difference is
+**Degradation** is the loss of predictive log-likelihood with the horizon. To predict step t > c, the closed loop is
+given o_1 to o_{t-1} (`pll`), the open loop o_1 to o_c (`open_loop_marginal`). The difference is
 log p(o_t | o_{1:t-1}) - log p(o_t | o_{1:c}), in nats.
 """
 
@@ -15,29 +15,38 @@ from torch import Tensor
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import TrainedRun
 
-__all__ = ["SCORES", "EvaluatedRun", "Pair", "at_horizons", "degradation", "note", "pair", "score_of"]
+__all__ = [
+    "SCORES",
+    "EvaluatedRun",
+    "Pair",
+    "at_horizons",
+    "compare_pairs",
+    "degradation",
+    "record_differences",
+    "score_of",
+]
 
-_ALL_PAIRS = 4  # runs up to which every two are compared; of more, each with the first
+_ALL_PAIRS = 4  # up to this many runs, all pairs are compared; with more runs, each is compared with the first
 SCORES = ("elbo", "iwae", "pll", "fivo", "open_loop")
-"""Of these more is better; the others are parts or diagnostics."""
+"""Scores for which higher is better. All other metrics are parts of them or diagnostics."""
 _HORIZONS = (1, 2, 5, 10)
 
 Curves = Mapping[str, Mapping[str, Sequence[float]]]
-"""By metric, then by model, the mean of each step, `(T,)`."""
+"""Mean at each step, `(T,)`, by metric, then by model."""
 
 
 class EvaluatedRun(NamedTuple):
-    """One run, measured."""
+    """A run and its scores."""
 
     run: TrainedRun
     entries: dict[str, dict[str, Any]]
-    """For `evaluation.json`, by metric."""
+    """Entries of `evaluation.json`, by metric."""
     totals: dict[str, Tensor]
-    """The score of each sequence, by metric, `(N,)`."""
+    """Score of each sequence, `(N,)`, by metric."""
 
 
 class Pair(NamedTuple):
-    """Two runs and the mean difference first - second of each score that both have, over the same sequences."""
+    """Two runs and the mean difference, first - second, of each score they share, over the same sequences."""
 
     first: EvaluatedRun
     second: EvaluatedRun
@@ -45,12 +54,12 @@ class Pair(NamedTuple):
 
 
 def score_of(metric: str) -> str:
-    """Return the score of a full name: `test[:1000]/pll[bernoulli,K=128]` to `pll`."""
+    """Return the score in a metric's full name, e.g. `pll` for `test[:1000]/pll[bernoulli,K=128]`."""
     return metric.partition("/")[2].partition("[")[0]
 
 
-def pair(measured: Sequence[EvaluatedRun]) -> list[Pair]:
-    """Compare every two runs, or where there are many each with the first."""
+def compare_pairs(measured: Sequence[EvaluatedRun]) -> list[Pair]:
+    """Compare all pairs of runs; with more than four runs, compare each with the first."""
     pairs = list(itertools.combinations(measured, 2))
     if len(measured) > _ALL_PAIRS:
         pairs = pairs[: len(measured) - 1]  # those with the first come first
@@ -68,18 +77,20 @@ def pair(measured: Sequence[EvaluatedRun]) -> list[Pair]:
     ]
 
 
-def note(first: EvaluatedRun, second: EvaluatedRun, differences: dict[str, Estimate]) -> None:
-    """Note the differences of a pair in the entries of both."""
+def record_differences(first: EvaluatedRun, second: EvaluatedRun, differences: dict[str, Estimate]) -> None:
+    """Add the differences of a pair to the entries of both runs."""
     for name, difference in differences.items():
-        for one, other, sign in [(first, second, 1), (second, first, -1)]:
+        for evaluated, other, sign in [(first, second, 1), (second, first, -1)]:
             mine = {"minus": other.run.path, "mean": sign * difference.mean}
-            one.entries[name].setdefault("paired", []).append(mine | {"standard_error": difference.standard_error})
+            evaluated.entries[name].setdefault("paired", []).append(
+                mine | {"standard_error": difference.standard_error}
+            )
 
 
 def degradation(curves: Curves) -> dict[str, dict[str, list[float]]]:
-    """Subtract the open-loop curves from the closed-loop ones of the same sequences; 0 within the context.
+    """Return the closed-loop curves minus the open-loop curves of the same sequences; 0 within the context.
 
-    Its name has the numbers of the open loop: `test[:1000]/degradation[bernoulli,K=1000,c=15]`.
+    The metric's name keeps the settings of the open loop: `test[:1000]/degradation[bernoulli,K=1000,c=15]`.
     """
     found = {}
     for metric, open_loop in curves.items():
@@ -95,7 +106,7 @@ def degradation(curves: Curves) -> dict[str, dict[str, list[float]]]:
 
 
 def at_horizons(metric: str, curves: Mapping[str, Sequence[float]]) -> dict[str, dict[int, float]]:
-    """Return, by model, what the degradation is 1, 2, 5, 10 steps after the context, and at the end."""
+    """Return each model's degradation 1, 2, 5 and 10 steps after the context, and at the last step."""
     context = _context(metric)
     end = len(next(iter(curves.values()))) - context
     horizons = [*(horizon for horizon in _HORIZONS if horizon < end), end]

@@ -1,6 +1,6 @@
-r"""n-grams of pen moves: what digit strokes are worth to a model that has never seen a picture.
+r"""n-grams of pen moves: the log-likelihood of digit strokes under a model without images.
 
-A move m_t leads from a pixel of the pen's path to the next: to one of its 8 neighbours, or by a jump to any pixel x.
+A move m_t leads from one pixel of the pen's path to the next: to one of its 8 neighbours, or by a jump to any pixel x.
 
 .. math::
 
@@ -9,10 +9,10 @@ A move m_t leads from a pixel of the pen's path to the next: to one of its 8 nei
 
     p_n(m \mid c) = \frac{N(c, m) + \alpha\, p_{n-1}(m \mid c')}{N(c) + \alpha}, \qquad p_{-1} = \tfrac19
 
-N counts the training split, c' is the context c less its earliest move, and :math:`\alpha = 5`. First pixels
-:math:`p_1` and targets of jumps :math:`p_J` are empirical, with as many pseudo-counts spread over all pixels. The path
-determines the frames, so this is a lower bound of their log-probability: a model of frames below it has not learned how
-a pen moves.
+N are counts in the training split, c' is the context c without its earliest move, and :math:`\alpha = 5`. First pixels
+:math:`p_1` and targets of jumps :math:`p_J` are empirical, with :math:`\alpha` pseudo-counts spread over all pixels.
+The path determines the frames, so this is a lower bound of their log-probability: a model of frames with a lower score
+has not learned how a pen moves.
 """
 
 from functools import lru_cache
@@ -29,7 +29,7 @@ __all__ = ["ORDERS", "NGrams", "fit_ngrams"]
 
 ORDERS = (1, 2, 3, 4, 5)
 _JUMP, _START, _SYMBOLS = 8, 9, 10
-"""Moves are 0 to 7, or a jump; a context may also reach back to before the first move."""
+"""Moves are 0 to 7, or a jump; a context may also contain the start of the path."""
 _PSEUDO_COUNTS = 5.0
 
 
@@ -41,15 +41,15 @@ class _Moves(NamedTuple):
     move: Tensor
     """m_t that leads to x_t, int64 `(B, P)`; the first is `_START`."""
     valid: Tensor
-    """True where the point is no padding, `(B, P)`."""
+    """False on padding, `(B, P)`."""
 
 
 class NGrams:
     """n-grams of all `ORDERS`, fitted on the training digits up to some length.
 
     Args:
-        source: of the strokes.
-        length: T; later points of longer digits do not count.
+        source: digit strokes.
+        length: number of steps T; later points of longer digits are ignored.
     """
 
     def __init__(self, source: Strokes, length: int) -> None:
@@ -58,27 +58,27 @@ class NGrams:
         later = valid & (move != _START)
         self.counts = []
         for order in range(max(ORDERS) + 1):
-            place = _context(move, order) * (_JUMP + 1) + move  # (B, P)
+            code = _context(move, order) * (_JUMP + 1) + move  # (B, P)
             size = _SYMBOLS**order * (_JUMP + 1)
-            self.counts.append(torch.bincount(place[later], minlength=size).view(-1, _JUMP + 1).double())
-        self.first = _log_share(pixel[:, 0])  # (H W,)
-        self.target = _log_share(pixel[later & (move == _JUMP)])  # (H W,)
+            self.counts.append(torch.bincount(code[later], minlength=size).view(-1, _JUMP + 1).double())
+        self.first = _log_frequency(pixel[:, 0])  # (H W,)
+        self.target = _log_frequency(pixel[later & (move == _JUMP)])  # (H W,)
 
     def log_prob(self, split: Split, count: int) -> dict[int, Tensor]:
         """Return log p of each step of the first `count` digits in nats, by order, float64 `(N, T)`; 0 on padding."""
         pixel, move, valid = self._moves(split, count)
         begins, jumps = move == _START, move == _JUMP
-        place = self.first[pixel] * begins + self.target[pixel] * jumps  # (N, P)
-        share = torch.full_like(place, 1 / (_JUMP + 1))  # (N, P)
+        log_pixel = self.first[pixel] * begins + self.target[pixel] * jumps  # (N, P)
+        probability = torch.full_like(log_pixel, 1 / (_JUMP + 1))  # (N, P)
         index = move.clamp(max=_JUMP)[..., None]
-        found = {}
+        by_order = {}
         for order, counts in enumerate(self.counts):
             of_context = counts[_context(move, order)]  # (N, P, 9)
-            number = of_context.gather(-1, index)[..., 0]  # (N, P)
-            share = (number + _PSEUDO_COUNTS * share) / (of_context.sum(-1) + _PSEUDO_COUNTS)
-            log_prob = (place + share.log() * ~begins) * valid  # (N, P)
-            found[order] = log_prob.unflatten(1, (self.length, -1)).sum(-1)  # (N, T)
-        return {order: found[order] for order in ORDERS}
+            of_move = of_context.gather(-1, index)[..., 0]  # (N, P)
+            probability = (of_move + _PSEUDO_COUNTS * probability) / (of_context.sum(-1) + _PSEUDO_COUNTS)
+            log_prob = (log_pixel + probability.log() * ~begins) * valid  # (N, P)
+            by_order[order] = log_prob.unflatten(1, (self.length, -1)).sum(-1)  # (N, T)
+        return {order: by_order[order] for order in ORDERS}
 
     def _moves(self, split: Split, count: int) -> _Moves:
         points, number = self.source.gather(split, torch.arange(count), self.length)
@@ -103,7 +103,7 @@ def _moves(paths: StrokePoints) -> _Moves:
 
 
 def _context(move: Tensor, order: int) -> Tensor:
-    """Number the last `order` moves before each one: `(B, P)` to 0 … 10^order - 1, `(B, P)`."""
+    """Encode the `order` moves before each move as one integer in 0 … 10^order - 1, `(B, P)` to `(B, P)`."""
     context = torch.zeros_like(move)
     for back in range(1, order + 1):
         before = torch.full_like(move, _START)
@@ -112,8 +112,8 @@ def _context(move: Tensor, order: int) -> Tensor:
     return context
 
 
-def _log_share(pixel: Tensor) -> Tensor:
-    """Return the logarithm of how often each pixel occurs, smoothed, float64 `(H W,)`."""
+def _log_frequency(pixel: Tensor) -> Tensor:
+    """Return the log of the smoothed relative frequency of each pixel, float64 `(H W,)`."""
     count = torch.bincount(pixel, minlength=SIDE * SIDE).double()
     smooth = count + _PSEUDO_COUNTS / len(count)
     return (smooth / smooth.sum()).log()

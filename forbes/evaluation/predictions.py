@@ -1,4 +1,4 @@
-"""Predictions: what a model that saw the beginning of a sequence expects of its rest."""
+"""Predict the rest of a sequence from its beginning."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from forbes.errors import ForbesError
 from forbes.models import BeliefModel, Rollout, State, StateSpaceModel
 from forbes.shapes import printed_by_shape
 
-__all__ = ["Completions", "complete", "filter", "first_of_each_class", "imagine", "open_loop", "whole_sequences"]
+__all__ = ["Completions", "complete", "filter", "first_of_each_class", "imagine", "open_loop_frames", "whole_sequences"]
 
 
 @printed_by_shape
@@ -18,9 +18,9 @@ class Completions(NamedTuple):
     """Sampled futures of some sequences after their first `context` steps."""
 
     frames: Tensor
-    """Pictures in [0, 1] of steps context + 1 … T, `(N, B, T - context, C, H, W)`."""
+    """Images in [0, 1] of steps context + 1 … T, `(N, B, T - context, C, H, W)`."""
     context: int
-    """Steps that the model saw."""
+    """Number of steps that the model saw."""
 
     def at(self, time: int) -> Tensor:
         """Return the frames of step `time`, counted from 1 as in the paper, `(N, B, C, H, W)`."""
@@ -32,8 +32,8 @@ def filter(model: BeliefModel, batch: SequenceBatch, samples: int = 1) -> State:
     """Sample the belief over (h, s) after the last step of each sequence, given all its observations and actions.
 
     Args:
-        model: on the batch's device, `world.model` of a `WorldModel`.
-        batch: B sequences of T steps. Padding is not left out: cut sequences that end earlier.
+        model: `world.model` of a `WorldModel`, on the batch's device.
+        batch: B sequences of T steps. Padding is filtered too, so cut sequences that end earlier.
         samples: number of samples per sequence, N, from torch's global generator.
 
     Returns:
@@ -52,20 +52,20 @@ def filter(model: BeliefModel, batch: SequenceBatch, samples: int = 1) -> State:
 
 @torch.no_grad()
 def imagine(model: BeliefModel, belief: State, action: Tensor) -> Rollout:
-    """Roll samples of the belief on without observations, each on its own trajectory.
+    """Roll out belief samples without observations, each on its own trajectory.
 
     Args:
-        model: on the device of the belief, `world.model` of a `WorldModel`.
+        model: `world.model` of a `WorldModel`, on the belief's device.
         belief: N samples for each of B sequences, as `filter` returns them.
-        action: the action that leads to each step, shape `(B, T, A)`, the same for all N samples of a sequence. A
-            process without actions has A = 0: `torch.zeros(B, T, 0)`.
+        action: action that leads to each step, shape `(B, T, A)`, the same for all N samples of a sequence. Without
+            actions A = 0: `torch.zeros(B, T, 0)`.
 
     Returns:
-        T steps after `belief`, shape `(N B, T, ...)`. `model.decode(rollout.features)` gives the parameters of the
-        likelihood, of which `model.likelihood` gives mean, sample and log-density.
+        T steps after `belief`, shape `(N B, T, ...)`. `model.decode(rollout.features)` returns the parameters of the
+        likelihood; `model.likelihood` has their mean, samples and log-density.
 
     Raises:
-        ForbesError: where the belief does not have a whole number of samples per sequence.
+        ForbesError: if the number of belief samples is not a multiple of the number of sequences.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
@@ -88,19 +88,19 @@ def imagine(model: BeliefModel, belief: State, action: Tensor) -> Rollout:
 def complete(
     model: BeliefModel, source: SequenceSource, batch: SequenceBatch, context: int, samples: int, mean: bool = False
 ) -> Completions:
-    r"""Filter the first `context` steps, draw N of the belief over (h, s), roll each on to the batch's last step.
+    r"""Filter the first `context` steps, draw N belief samples of (h, s), and roll each out to the batch's last step.
 
-    Each sample keeps its own trajectory, so what it has decided stays decided. A model without randomness has one
-    trajectory. A picture is :math:`E[o_t \mid h_t, s_t]`; where observations are increments, it is the drawing so far:
-    what was seen, and what :math:`o_u \sim p(\cdot \mid h_u, s_u)` has added since, step by step.
+    Each sample keeps its own trajectory, so its completion is consistent over time. A model without randomness has one
+    trajectory. A frame is :math:`E[o_t \mid h_t, s_t]`. If observations are increments, it is the drawing so far: the
+    observed strokes plus sampled ones, :math:`o_u \sim p(\cdot \mid h_u, s_u)`, step by step.
 
     Args:
-        model: on the batch's device.
-        source: of the batch.
+        model: model on the batch's device.
+        source: data source of the batch.
         batch: B sequences of T steps, T above `context`.
-        context: steps that the model sees.
-        samples: N.
-        mean: of increments, take the expectation in the place of a draw: how likely each pixel is on, in grey.
+        context: number of steps that the model sees.
+        samples: number of samples per sequence, N.
+        mean: for increments, use the expectation instead of a sample: the probability of each pixel, in grey.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
@@ -124,16 +124,16 @@ def complete(
 
 
 @torch.no_grad()
-def open_loop(model: StateSpaceModel, batch: SequenceBatch, context: int) -> Tensor:
+def open_loop_frames(model: StateSpaceModel, batch: SequenceBatch, context: int) -> Tensor:
     """Return E[o_t | features] in [0, 1], `(B, T, C, H, W)`, along one trajectory of each sequence.
 
-    Up to `context` the features are the posterior's, which has seen o_t; later ones are the prior's, rolled on from the
-    belief at `context` by the actions that were taken.
+    Up to `context` the features are the posterior's, given o_t. Later ones are a rollout of the prior from the belief
+    at `context` with the recorded actions.
 
     Args:
-        model: on the batch's device.
+        model: model on the batch's device.
         batch: B sequences of T steps, T above `context`.
-        context: steps that the model sees.
+        context: number of steps that the model sees.
     """
     filtered = model.filter(model.embed(batch.observation[:, :context]), batch.action[:, :context])
     imagined = model.imagine(filtered.at(-1), batch.action[:, context:])
@@ -142,18 +142,18 @@ def open_loop(model: StateSpaceModel, batch: SequenceBatch, context: int) -> Ten
 
 
 def whole_sequences(data: SequenceDataModule, split: Split, index: Tensor) -> SequenceBatch:
-    """Return sequences up to the end of the longest, but no shorter than the module's own length."""
+    """Return sequences up to the end of the longest one, with at least the data module's own length."""
     length = data.length
     while (batch := data.sequences(split, index, length)).mask[:, -1].any():
         length *= 2
     last = max(data.length, int(batch.mask.sum(1).max()))
-    return SequenceBatch(*(values[:, :last] for values in batch))  # (B, last, ...)
+    return batch.first(last)  # (B, last, ...)
 
 
 def first_of_each_class(data: SequenceDataModule, split: Split, count: int) -> Tensor:
-    """Choose sequences that no model has a say in: the first of each class, then the second, …; `(count,)`, int64.
+    """Return indices of the first sequence of each class, then the second of each, …: `(count,)`, int64.
 
-    A source without classes gives its first ones.
+    Without classes, return the first indices of the split.
     """
     size = data.source.size(split)
     if not isinstance(data.source, Strokes):

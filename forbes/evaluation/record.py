@@ -1,8 +1,8 @@
-"""What an evaluation leaves in a run folder: `evaluation.json` for people, `evaluation.npz` for programs.
+"""Results of an evaluation in a run folder: `evaluation.json` for people, `evaluation.npz` for programs.
 
-Both hold one entry for each metric, by its full name, which says the split (`test`, or `test[:1000]` for its first
-so many sequences), the score, the likelihood and the numbers of samples: `test[:1000]/pll[bernoulli,K=128]`.
-Measuring a metric again replaces its entry.
+Both have one entry per metric. Its full name has the split (`test`, or `test[:1000]` for the first 1000 sequences),
+the score, the likelihood and the number of samples: `test[:1000]/pll[bernoulli,K=128]`. Evaluating a metric again
+replaces its entry.
 """
 
 import fcntl
@@ -30,7 +30,7 @@ _REMEDY = "Delete it and evaluate again"
 
 
 def describe(scores: Scores, metric: str) -> dict[str, Any]:
-    """Describe the metric over sequences: the entry of `evaluation.json`, all in nats."""
+    """Return the summary of a metric over sequences, in nats: its entry in `evaluation.json`."""
     values, steps, total = scores.values[metric], scores.steps, scores.total(metric)
     shares = {"minimum": 0.0, "5%": 0.05, "median": 0.5, "95%": 0.95, "maximum": 1.0}
     counts = scores.mask.sum(0)  # (T,)
@@ -46,35 +46,35 @@ def describe(scores: Scores, metric: str) -> dict[str, Any]:
 
 
 def results_folders(runs: Sequence[str], output: str | None = None) -> dict[str, Path]:
-    """Say where the results of each run go.
+    """Return the folder for the results of each run.
 
     Args:
         runs: run folders, or checkpoints in them.
-        output: a folder that gets one for each run, of its name; by default results go into the run folder.
+        output: parent folder, in which each run gets a folder of its name. Default: the run folder itself.
 
     Raises:
-        ForbesError: where two runs would have the same folder in `output`, or a folder cannot be written to.
+        ForbesError: if two runs would share a folder in `output`, or a folder is not writable.
     """
     folders: dict[str, Path] = {}
     for run in runs:
         folder = RunFolder(run)
-        place = folder.results
+        results = folder.results
         if output is not None:
             name = folder.path.resolve().name
-            place = Path(output) / (name if place == folder.path else f"{name}-{folder.checkpoint.stem}")
-            if place in folders.values():
+            results = Path(output) / (name if results == folder.path else f"{name}-{folder.checkpoint.stem}")
+            if results in folders.values():
                 raise ForbesError(f"{run}: another run is called {name} too. Evaluate them with different --output")
         if folder.path.is_dir() and output is None and not os.access(folder.path, os.W_OK):
             raise ForbesError(f"{run}: cannot be written to. Let the results go elsewhere: --output DIR")
-        folders[run] = place
+        folders[run] = results
     return folders
 
 
 def read_record(run: str | Path) -> dict[str, Any]:
-    """Read `evaluation.json`; a run that was never evaluated has an empty one.
+    """Read `evaluation.json`; return an empty record for a run that was never evaluated.
 
     Raises:
-        ForbesError: where it is not JSON, or an entry is not what an evaluation writes.
+        ForbesError: if it is not JSON, or an entry is not one that an evaluation writes.
     """
     path = RunFolder(run).results / "evaluation.json"
     if not path.exists():
@@ -92,7 +92,7 @@ def read_record(run: str | Path) -> dict[str, Any]:
 
 
 def _is_estimate(value: Any) -> bool:
-    """Tell whether this is an `Estimate`; of infinite errors both numbers are null."""
+    """Return whether this is an `Estimate`, whose numbers are null if they are infinite."""
     if not isinstance(value, dict) or not {"mean", "standard_error"} <= value.keys():
         return False
     return all(value[name] is None or is_number(value[name]) for name in ("mean", "standard_error"))
@@ -111,18 +111,18 @@ _FIELDS: dict[str, Callable[[Any], bool]] = {
     ),
     "references": lambda value: isinstance(value, dict) and all(map(_is_estimate, value.values())),
 }
-"""What those who read an entry may take for granted of each field, where it is there."""
+"""Check of each field of an entry, if the entry has it. Readers rely on these."""
 
 
 def require_readable(folders: Iterable[str | Path]) -> None:
-    """Read what earlier evaluations have left, to say what is broken before minutes are spent."""
+    """Read the results of earlier evaluations, so that a damaged file is reported before minutes are spent."""
     for folder in folders:
         read_record(folder)
         read_arrays(folder)
 
 
 def read_arrays(run: str | Path) -> dict[str, NDArray[np.float64]]:
-    """Read `evaluation.npz`, the scores of each sequence by metric, `(N,)`; none before the first evaluation."""
+    """Read `evaluation.npz`: the score of each sequence, `(N,)`, by metric. Empty before the first evaluation."""
     path = RunFolder(run).results / "evaluation.npz"
     if not path.exists():
         return {}
@@ -137,7 +137,7 @@ def read_arrays(run: str | Path) -> dict[str, NDArray[np.float64]]:
 def write_record(run: str | Path, entries: dict[str, dict[str, Any]], totals: dict[str, Tensor]) -> None:
     """Replace entries of `evaluation.json`, and the scores of each sequence, `(N,)`, in `evaluation.npz`.
 
-    Evaluations that end together wait for each other, so that the entries of all are kept.
+    A lock makes concurrent evaluations wait for each other, so that no entry is lost.
     """
     folder = RunFolder(run).results
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,11 +1,11 @@
-r"""What a score must exceed to mean anything: log p of the same sequences by models that hold no belief.
+r"""Reference scores that a model should exceed: log p of the same sequences under models without a belief.
 
-Of digit strokes the n-grams of pen moves (`forbes.evaluation.ngram`). Of images with a Gaussian likelihood two still
-pictures under the model's own standard deviation: the frame before, and the mean frame of the training split,
+For digit strokes, n-grams of pen moves (`forbes.evaluation.ngram`). For images with a Gaussian likelihood, two constant
+predictions with the model's own standard deviation: the previous frame, and the mean frame of the training split,
 
 .. math:: \log p(o_{1:T}) = \sum_t \log N(o_t;\, o_{t-1}, \sigma^2), \qquad \sum_t \log N(o_t;\, \bar o, \sigma^2),
 
-where :math:`o_0 = \bar o`. A model below them has learned less than that nothing moves.
+where :math:`o_0 = \bar o`. A model below them predicts worse than if nothing moved.
 """
 
 from collections.abc import Mapping
@@ -16,33 +16,33 @@ from torch import Tensor
 from forbes.data import SequenceDataModule, Split, Strokes
 from forbes.evaluation.ngram import fit_ngrams
 from forbes.models import Likelihood, Normal
+from forbes.seeding import forked
 
 __all__ = ["lowest_above", "reference_means", "references"]
 
 _EXAMPLES, _ROWS = 500, 50
-"""Training sequences whose mean frame is taken, and how many are decoded at a time."""
+"""Number of training sequences in the mean frame, and number of sequences decoded at a time."""
 
 
 def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
-    """Return by name log p of each step of the first `count` sequences in nats, float64 `(N, T)`, 0 on padding."""
+    """Return log p of each step of the first `count` sequences in nats, float64 `(N, T)`, by name; 0 on padding."""
     if isinstance(data.source, Strokes):
         ngrams = fit_ngrams(data.source, data.length)
         return {f"{order}-gram": values for order, values in ngrams.log_prob(split, count).items()}
     if isinstance(likelihood, Normal):
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # of the noise below the bits of coarse pixels
+        with forked("cpu", 0):  # for the dequantisation noise of coarse pixels
             return _still_pictures(data, likelihood, split, count)
     return {}
 
 
 def reference_means(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, float]:
-    """Return by name the mean of log p in nats per sequence, over the first `count` sequences; none for no sequence."""
+    """Return the mean of log p over the first `count` sequences, in nats per sequence, by name; empty if count is 0."""
     found = references(data, likelihood, split, count) if count else {}
     return {name: values.sum(1).mean().item() for name, values in found.items()}
 
 
 def lowest_above(score: float, means: Mapping[str, float]) -> str | None:
-    """Return the name of the lowest reference above a score; None where it is above all or there is none."""
+    """Return the name of the lowest reference above a score, or None if there is none above it."""
     above = [(mean, name) for name, mean in means.items() if mean > score]
     return min(above)[1] if above else None
 

@@ -1,4 +1,4 @@
-"""Trained runs that are looked at together: what each is, and whether their numbers may be compared."""
+"""Load trained runs, name them, and check that they are comparable."""
 
 import hashlib
 import os
@@ -20,26 +20,26 @@ __all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs",
 __all__ += ["split_batches"]
 
 _PUBLISHED: dict[type[nn.Module], str] = {GaussianBelief: "RSSM", FlowBelief: "FORBES"}
-"""Models whose name is not that of their class."""
+"""Published names of the models whose name differs from their class."""
 
 
 class TrainedRun(NamedTuple):
-    """A run folder with what it has learned."""
+    """A run folder and the model loaded from it."""
 
     path: str
-    """As the user gave it."""
+    """Path as the user typed it."""
     model: BeliefModel
     data: SequenceDataModule
     checkpoint: str
-    """SHA-256 of the checkpoint that the model was read from."""
+    """SHA-256 of the checkpoint that the model was loaded from."""
     config: dict[str, Any]
-    """Sections `model` and `data` of config.yaml without the seeds: runs that differ in the seed only have the same."""
+    """Sections `model` and `data` of config.yaml without seeds: equal for runs that differ only in the seed."""
 
     @property
     def family(self) -> str:
-        """The model's name, e.g. FORBES, or Mixture of a `MixtureBelief`.
+        """Name of the model, e.g. FORBES, or Mixture for a `MixtureBelief`.
 
-        What its experiment's name adds follows: RSSM wide for `rssm_wide`.
+        A suffix of the experiment's name is appended: RSSM wide for `rssm_wide`.
         """
         kind = _kind(self.model)
         name = _PUBLISHED.get(kind, kind.__name__.removesuffix("Belief").removesuffix("Model"))
@@ -50,36 +50,36 @@ class TrainedRun(NamedTuple):
 
     @property
     def parameters(self) -> int:
-        """How many numbers were learned."""
+        """Number of parameters."""
         return sum(parameter.numel() for parameter in self.model.parameters())
 
 
 def run_titles(runs: Sequence[TrainedRun]) -> list[str]:
-    """Name runs for a picture: by family, and where several are of one, by what their folders do not share."""
+    """Return a title for each run: its family, with the distinguishing part of its folder if the family repeats."""
     folders: dict[str, list[Path]] = {}
     for run in runs:
         folders.setdefault(run.family, []).append(Path(run.path).resolve())
     titles = []
     for run in runs:
         name, same = run.family, folders[run.family]
-        own = Path(run.path).resolve().relative_to(os.path.commonpath(same))
-        titles.append(name if len(same) == 1 else f"{name} ({own})")
+        suffix = Path(run.path).resolve().relative_to(os.path.commonpath(same))
+        titles.append(name if len(same) == 1 else f"{name} ({suffix})")
     return titles
 
 
 def find_device(name: str) -> str:
-    """Choose a device, and try it.
+    """Return the name of a usable device.
 
     Args:
-        name: "auto", or as torch calls it.
+        name: "auto" (CUDA if available), or a torch device.
 
     Raises:
-        ForbesError: where it cannot be used.
+        ForbesError: if the device cannot be used.
     """
     chosen = ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
     try:
         torch.zeros(1, dtype=torch.float64, device=chosen)
-    # What torch raises for a name it does not know, without CUDA, and where there is no float64.
+    # Unknown name, no CUDA, and no float64, in this order.
     except (RuntimeError, AssertionError, TypeError) as error:
         reason = str(error).splitlines()[0]
         raise ForbesError(f"--device {name}: it cannot be used ({reason}). Choose cpu, or auto") from error
@@ -87,7 +87,7 @@ def find_device(name: str) -> str:
 
 
 def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
-    """Load runs, their models on a device."""
+    """Load runs, with their models on `device`."""
     runs = []
     for path in paths:
         module, data, config, checkpoint = open_run(path)
@@ -97,7 +97,7 @@ def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
 
 
 def _kind(model: BeliefModel) -> type[nn.Module]:
-    """Return what tells families apart: the belief's, or the model's where its filter is another."""
+    """Return the class that identifies a family: the belief's, or the model's if its filter is not the RSSM's."""
     if type(model) is not StateSpaceModel:
         return type(model)
     prior, posterior = model.prior, model.posterior
@@ -112,18 +112,18 @@ def _without_seed(section: dict[str, Any]) -> dict[str, Any]:
 def split_batches(
     data: SequenceDataModule, split: Split, sequences: int, batch_size: int
 ) -> Iterator[tuple[int, SequenceBatch]]:
-    """Return the first so many sequences of a split in order, with the index of each batch's first."""
+    """Yield the first `sequences` sequences of a split in order, as batches with the index of their first sequence."""
     for index in torch.arange(sequences).split(batch_size):
         yield int(index[0]), data.sequences(split, index)
 
 
 def data_name(data: SequenceDataModule) -> str:
-    """Name the data: the source with its arguments, and the length."""
+    """Return a name for the data: the source with its arguments, and the length."""
     return f"{data.source}, {data.length} steps"
 
 
 def data_sha256(data: SequenceDataModule, split: Split, sequences: int) -> str:
-    """Hash the content of the first so many sequences of a split, as the model sees it."""
+    """Hash the first `sequences` sequences of a split, as the model sees them."""
     digest = hashlib.sha256()
     for _, batch in split_batches(data, split, sequences, batch_size=500):
         for values in (batch.observation, batch.action, batch.mask):
@@ -133,10 +133,10 @@ def data_sha256(data: SequenceDataModule, split: Split, sequences: int) -> str:
 
 
 def require_comparable(runs: Sequence[TrainedRun], hashes: Sequence[str]) -> None:
-    """Refuse runs whose data, by their hash, or whose likelihoods differ: their numbers are about different things.
+    """Require that all runs have the same data (by hash) and likelihood, so that their scores can be compared.
 
     Raises:
-        ForbesError: naming the first two that differ.
+        ForbesError: if two runs differ; names them.
     """
     first, first_hash = runs[0], hashes[0]
     for run, sha256 in zip(runs[1:], hashes[1:], strict=True):

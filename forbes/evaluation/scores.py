@@ -1,7 +1,7 @@
-r"""The scores of a model on sequences, by one convention.
+r"""Scores of a model on sequences, by one convention.
 
-Observation log-likelihood only, fully normalised, in nats; no free nats; the Monte-Carlo KL for every family; padding
-does not count; logarithms and sums of probabilities in float64. With
+Observation log-likelihoods only, fully normalised, in nats; no free nats; the Monte-Carlo KL for every family; padding
+is not scored; log-probabilities are summed in float64. With
 :math:`w_t = p(o_t \mid h_t, s_t)\, p(s_t \mid h_t) / q(s_t \mid h_t, e_t)` along a trajectory of the posterior,
 
 .. math::
@@ -15,15 +15,15 @@ does not count; logarithms and sums of probabilities in float64. With
     (h_c, s_c)^k \sim \text{belief}, \quad (h_t, s_t)^k \sim \text{prior}
 
 - IWAE (Burda et al., 2016, arXiv 1509.00519): the product over time is inside the mean over particles.
-- The PLL, a prequential log-likelihood, scores the filtering belief: its particles are drawn from the belief after
-  t - 1 observations (h_t follows from it) and see o_t only in their score, so it is a proper score of the belief, and
-  its K-sample form a lower bound of itself (Jensen). The posterior helps to estimate the integral over s_t, without
-  bias (`StateSpaceModel.one_step_log_prob`). A model that draws weighted sets of particles has their weights in the
-  mean, one without randomness has K = 1.
+- PLL, the prequential log-likelihood, scores the filtering belief. Its particles are drawn from the belief after t - 1
+  observations (h_t follows from it), and o_t is used only to score them. So it is a proper score of the belief, and its
+  K-sample estimate is a lower bound of it (Jensen). The posterior helps to estimate the integral over s_t, without bias
+  (`StateSpaceModel.one_step_log_prob`). The weights of weighted particles enter the mean; a model without randomness
+  has K = 1.
 - FIVO (Maddison et al., 2017, arXiv 1705.09279) resamples, with the particles of `forbes.models.particles` and
-  systematic resampling, whatever the model is trained by.
-- Open loop: the mean over particles is outside the product over time and inside the logarithm, so a belief is rewarded
-  for holding the truth as one of several futures. Never the mean of logarithms, which rewards hedging.
+  systematic resampling, regardless of the training objective.
+- Open loop: the mean over particles is outside the product over time and inside the logarithm. This rewards a belief
+  that holds the truth as one of several futures; the mean of logarithms would reward hedging.
 """
 
 import math
@@ -42,10 +42,10 @@ __all__ = ["Increments", "LogMeanExp", "Trajectory", "frame_log_prob", "score_op
 __all__ += ["score_predictions", "score_trajectories", "trajectories"]
 
 Increments = dict[str, Tensor]
-"""Scores by name, `(B, T)` each in nats, float64: what each step adds; the sum over t is the sequence's score."""
+"""Contribution of each step by score, `(B, T)`, in nats, float64. Their sum over t is the score of the sequence."""
 
 _FRAMES = 1000
-"""Decoded at a time: the memory stays bounded, and a digit's pixels in the processor's cache (a third less time)."""
+"""Number of frames decoded at a time: memory is bounded, and digits fit into the CPU cache (a third less time)."""
 
 
 class Trajectory(NamedTuple):
@@ -56,55 +56,55 @@ class Trajectory(NamedTuple):
     kl: Tensor
     """log q(s_t) - log p(s_t), `(B, T)`."""
     prediction: Tensor | None
-    """An estimate of log p(o_t | h_t) (`StateSpaceModel.one_step_log_prob`), `(B, T)`; None where it is not wanted."""
+    """An estimate of log p(o_t | h_t) (`StateSpaceModel.one_step_log_prob`), `(B, T)`; None unless it was requested."""
 
 
 class LogMeanExp:
     r"""A running :math:`\log \frac1K \sum_k e^{x_k}`: the memory does not grow with K."""
 
     def __init__(self) -> None:
-        self.number = 0
+        self.count = 0
         self.total = torch.tensor(-math.inf, dtype=torch.float64)
 
     def add(self, value: Tensor) -> None:
-        """Take one more x_k, any shape, the same each time."""
-        self.number += 1
+        """Add one x_k, of any shape, the same in each call."""
+        self.count += 1
         self.total = torch.logaddexp(self.total.to(value.device), value)
 
     def result(self) -> Tensor:
-        """Return the log-mean-exp of what was added."""
-        return self.total - math.log(self.number)
+        """Return the log-mean-exp of the values added so far."""
+        return self.total - math.log(self.count)
 
 
 def frame_log_prob(model: BeliefModel, features: Tensor, target: Tensor) -> Tensor:
     """Return log p(o | features) in nats, float64, a few frames at a time.
 
     Args:
-        model: decodes the features.
-        features: `(*, N, F)`.
-        target: the frames, as `Likelihood.target` gives them, `(N, *O)`; each is scored under every leading index.
+        model: model that decodes the features.
+        features: model features, `(*, N, F)`.
+        target: frames as returned by `Likelihood.target`, `(N, *O)`. Each is scored under every leading index.
 
     Returns:
         `(*, N)`.
     """
     size = max(1, _FRAMES // math.prod(features.shape[:-2]))
     parts = [
-        model.log_likelihood(some, true).double()
-        for some, true in zip(features.split(size, -2), target.split(size), strict=True)
+        model.log_likelihood(chunk, frames).double()
+        for chunk, frames in zip(features.split(size, -2), target.split(size), strict=True)
     ]
     return torch.cat(parts, -1)  # (*, N)
 
 
 def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, predict: bool) -> Iterator[Trajectory]:
-    """Draw trajectories one after the other, so that the memory is that of one; the encoder runs once.
+    """Sample trajectories one at a time, so that only one is in memory. The encoder runs once.
 
     Args:
-        model: in eval mode, on the batch's device.
+        model: model in eval mode, on the batch's device.
         batch: B sequences.
-        number: of trajectories.
-        predict: whether to draw the one-step predictions too.
+        number: number of trajectories.
+        predict: whether to sample one-step predictions as well.
     """
-    # Once: coarse pixels have noise, the same for both networks.
+    # Encode once: with coarse pixels the encoder and the likelihood must share the same noise.
     encoded = model.encode(batch.observation, batch.action)
     target = encoded.target.flatten(0, 1)  # (B T, *O)
 
@@ -121,9 +121,9 @@ def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, pred
 
 @torch.no_grad()
 def score_trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, predict: bool) -> Increments:
-    """Score a batch with K trajectories: `elbo`, `reconstruction`, `kl`, `iwae`, and `pll` where `predict` is set.
+    """Score a batch with K trajectories: `elbo`, `reconstruction`, `kl`, `iwae`, and `pll` if `predict` is set.
 
-    `iwae` is the bound of the first t steps less that of the first t - 1, so its sum is the bound of all.
+    `iwae` at step t is the bound of the first t steps minus that of the first t - 1, so it sums to the whole bound.
     """
     mask = batch.mask.double()
     reconstruction, kl = torch.zeros_like(mask), torch.zeros_like(mask)
@@ -147,9 +147,9 @@ def score_trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int
 
 @torch.no_grad()
 def score_predictions(model: BeliefModel, batch: SequenceBatch, number: int) -> Increments:
-    """Score a batch with K particles: `pll`, and `iwae` where the model has a posterior."""
+    """Score a batch with K particles: `pll`, and `iwae` if the model has a posterior."""
     if isinstance(model, StateSpaceModel) and model.particles == 1:
-        return score_trajectories(model, batch, number, predict=True)  # its trajectories serve both
+        return score_trajectories(model, batch, number, predict=True)  # the same trajectories give both scores
     encoded, prediction = model.encode(batch.observation, batch.action), LogMeanExp()
     for _ in range(model.num_belief_samples(number)):
         prediction.add(model.predictive_log_prob(encoded, partial(frame_log_prob, model)))
@@ -161,12 +161,12 @@ def score_predictions(model: BeliefModel, batch: SequenceBatch, number: int) -> 
 
 @torch.no_grad()
 def score_particles(model: StateSpaceModel, batch: SequenceBatch, number: int) -> Increments:
-    """Score a batch with K particles: `fivo`, and `ess`, the effective sample size before resampling, as a share of K.
+    """Score a batch with K particles: `fivo`, and `ess`, the effective sample size before resampling divided by K.
 
     Args:
-        model: in eval mode, on the batch's device.
-        batch: B sequences; K B rows are held at once.
-        number: K.
+        model: model in eval mode, on the batch's device.
+        batch: B sequences; all K B particles are in memory at once.
+        number: number of particles, K.
     """
     encoded, fivo, ess = model.encode(batch.observation, batch.action), [], []
     log_likelihood = partial(frame_log_prob, model)
@@ -179,18 +179,17 @@ def score_particles(model: StateSpaceModel, batch: SequenceBatch, number: int) -
 
 @torch.no_grad()
 def score_open_loop(model: BeliefModel, batch: SequenceBatch, number: int, context: int) -> Increments:
-    """Score a batch with K futures: `open_loop`, and `open_loop_marginal` for how it degrades with the horizon.
+    """Score a batch with K futures: `open_loop`, and `open_loop_marginal`, which shows the loss with the horizon.
 
     The sum of `open_loop` over t is log p(o_{c+1:T} | o_{1:c}); `open_loop_marginal` is log p(o_t | o_{1:c}) of each
-    step on its own. Both are 0 up to c. Each draw of the belief gives as many futures as it has particles: an RSSM's
-    one, from a posterior trajectory of its own, since the belief is over (h, s); that of a model without randomness is
-    the only one.
+    step by itself. Both are 0 up to c. Each belief sample gives one future per particle. In an RSSM that is one future,
+    from a posterior trajectory of its own, since the belief is over (h, s). A model without randomness has one future.
 
     Args:
-        model: in eval mode, on the batch's device.
+        model: model in eval mode, on the batch's device.
         batch: B sequences of T steps.
-        number: K.
-        context: c, steps that the model sees, from 1 to T - 1.
+        number: number of futures, K.
+        context: number of steps that the model observes, c, from 1 to T - 1.
     """
     mask = batch.mask[:, context:].double()  # (B, T - c)
     encoded = model.encode(batch.observation[:, :context], batch.action[:, :context])
@@ -199,8 +198,8 @@ def score_open_loop(model: BeliefModel, batch: SequenceBatch, number: int, conte
     joint, marginal = LogMeanExp(), LogMeanExp()
     for _ in range(model.num_belief_samples(number)):
         features = model.imagine(model.sample_beliefs(encoded, model.particles), future).features  # (N B, T - c, F)
-        of_each = features.view(model.particles, len(target), -1)  # (N, B (T - c), F)
-        for log_prob in frame_log_prob(model, of_each, target).view(-1, *mask.shape):  # N times (B, T - c)
+        by_particle = features.view(model.particles, len(target), -1)  # (N, B (T - c), F)
+        for log_prob in frame_log_prob(model, by_particle, target).view(-1, *mask.shape):  # N times (B, T - c)
             joint.add((log_prob * mask).cumsum(1))
             marginal.add(log_prob)
     before = torch.zeros_like(batch.mask[:, :context], dtype=torch.float64)  # (B, c)

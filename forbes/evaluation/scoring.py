@@ -1,4 +1,4 @@
-"""Score a model on a whole split, batch by batch: bounded memory, finite numbers only, and resumable."""
+"""Score a model on a whole split, batch by batch: memory is bounded, scores are finite, and it can be resumed."""
 
 import hashlib
 import io
@@ -27,7 +27,7 @@ from forbes.files import replace_file
 from forbes.models import BeliefModel, StateSpaceModel
 from forbes.pomdps import Process
 from forbes.reading import read_npz
-from forbes.seeding import derive_seed
+from forbes.seeding import derive_seed, forked
 
 __all__ = [
     "PartialScores",
@@ -43,58 +43,58 @@ __all__ = [
 
 
 class Scorer(NamedTuple):
-    """One way through the data, which gives one score or several."""
+    """One pass over the data, which computes one or more scores."""
 
     metrics: tuple[str, ...]
-    """The scores it is asked for, of those the function gives."""
+    """Names of the scores to keep, among those that `function` returns."""
     tag: str
-    """Numbers of samples and the like, part of each metric's name."""
+    """Settings such as the number of samples; part of each metric's name."""
     function: Callable[[Any, SequenceBatch], Increments]
-    """Of a model that has at least one of the metrics, and a batch."""
+    """Compute the scores of a model on a batch."""
     batch_size: int
-    """Sequences at a time."""
+    """Number of sequences per batch."""
     context: int = 0
-    """Steps at the beginning that are seen and not scored."""
+    """Number of leading steps that the model observes and that are not scored."""
 
     def of(self, model: BeliefModel) -> "Scorer":
-        """Leave the bounds out for a model without a posterior: its likelihood is exact, and `pll` gives it."""
+        """Drop the bounds for a model without a posterior: its likelihood is exact, and is reported as `pll`."""
         bounds = () if isinstance(model, StateSpaceModel) else _BOUNDS
         return self._replace(metrics=tuple(metric for metric in self.metrics if metric not in bounds))
 
 
 class Scores(NamedTuple):
-    """What a pass found for every sequence, in nats, float64 on the CPU."""
+    """Scores of all sequences, in nats, float64 on the CPU."""
 
     values: Increments
-    """By metric, what each step adds, 0 on padding, `(N, T)`."""
+    """Contribution of each step, `(N, T)`, by metric; 0 on padding."""
     mask: Tensor
-    """True where the step counts: neither padding nor context, `(N, T)`."""
+    """True where a step is scored (neither padding nor context), `(N, T)`."""
 
     @property
     def steps(self) -> Tensor:
-        """Steps of each sequence that count, `(N,)`."""
+        """Number of scored steps of each sequence, `(N,)`."""
         return self.mask.sum(1)
 
     def total(self, metric: str) -> Tensor:
-        """Return each sequence's score, `(N,)`: the sum over its steps, of the effective sample size the mean."""
+        """Return the score of each sequence, `(N,)`: the sum over steps, or the mean for the effective sample size."""
         total = self.values[metric].sum(1)
         return total / self.steps if metric == "ess" else total
 
 
 _BOUNDS = ("elbo", "reconstruction", "kl", "iwae", "fivo", "ess")
 _FIVO_ROWS = 16
-"""FIVO holds all particles of a sequence at once: so many rows for each sequence of another pass's batch."""
+"""FIVO holds all particles of a sequence at once. It gets this many rows per sequence of another scorer's batch."""
 
 
 def make_scorer(name: str, number: int, batch_size: int, context: int) -> Scorer:
-    """Build one of the passes that `forbes evaluate --scores` names.
+    """Build a scorer for one of the names accepted by `forbes evaluate --scores`.
 
     Args:
-        name: elbo (with its parts), pll (and the IWAE of the same trajectories), fivo (with its effective sample
+        name: elbo (with its parts), pll (with the IWAE of the same trajectories), fivo (with its effective sample
             size), or open-loop.
-        number: of samples S, particles or futures K.
-        batch_size: sequences at a time.
-        context: c, the steps that the open-loop score shows the model.
+        number: number of samples S (elbo), particles K (pll, fivo) or futures K (open-loop).
+        batch_size: number of sequences per batch.
+        context: number of steps that the model observes before the open-loop score begins, c.
     """
     if name == "elbo":
         function = partial(score_trajectories, number=number, predict=False)
@@ -124,24 +124,24 @@ def evaluate(
     """Score a model, trained or not, on the first sequences of a split, as `forbes evaluate` does for a run.
 
     Args:
-        model: `world.model` of a `WorldModel`; its device is where the scores are computed.
-        data: of the sequences.
-        scores: of elbo, pll, fivo and open-loop. Each gives several metrics: elbo its parts, pll the IWAE bound too,
-            fivo the effective sample size, open-loop its marginals. A `VectorModel` has no bounds.
+        model: `world.model` of a `WorldModel`. Scores are computed on its device.
+        data: data module with the sequences.
+        scores: some of elbo, pll, fivo and open-loop. Each adds metrics: elbo its parts, pll the IWAE bound, fivo the
+            effective sample size, open-loop the marginals. A `VectorModel` has no bounds.
         split: train, validation or test.
-        sequences: how many are scored, at most the whole split, at least 2.
-        samples: S of the ELBO.
-        particles: K of PLL, IWAE and FIVO.
-        futures: K of the open-loop score.
-        context: number of steps that the open-loop score shows the model.
-        batch_size: sequences at a time.
-        seed: random seed of the noise; the same seed and batch size give the same numbers.
+        sequences: number of sequences, at least 2; at most the whole split is scored.
+        samples: number of posterior samples for the ELBO, S.
+        particles: number of particles for PLL, IWAE and FIVO, K.
+        futures: number of futures for the open-loop score, K.
+        context: number of steps that the model observes before the open-loop score begins.
+        batch_size: number of sequences per batch.
+        seed: random seed for the noise. The same seed and batch size give the same scores.
 
     Returns:
-        Mean and standard error over the sequences by metric, in nats per sequence; `ess` as a share of K.
+        Mean and standard error over sequences by metric, in nats per sequence; `ess` as a fraction of K.
 
     Raises:
-        ForbesError: for a score that does not exist, fewer than two sequences, or a score that is not finite.
+        ForbesError: if a score does not exist or is not finite, or if there are fewer than two sequences.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
@@ -164,13 +164,13 @@ def evaluate(
     return found
 
 
-_EXACT_ROWS = 20  # sequences; a belief on a fine grid is 3 MB each
+_EXACT_ROWS = 20  # sequences; a belief on a fine grid takes 3 MB per sequence
 
 
 def exact_scorer(process: Process) -> Scorer:
-    """Build the pass that asks the process itself: `log_p`, the sum of its one-step predictive log-likelihoods.
+    """Build the scorer of the process's exact evidence `log_p`, the sum of its one-step predictive log-likelihoods.
 
-    No bound is above it, and no belief has a higher prequential score in expectation.
+    No bound exceeds it, and no belief has a higher prequential score in expectation.
     """
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
@@ -180,18 +180,18 @@ def exact_scorer(process: Process) -> Scorer:
 
 
 class PartialScores:
-    """Scores of finished batches, one file each, so that an interrupted evaluation goes on where it stopped.
+    """Scores of finished batches, one file each, so that an interrupted evaluation resumes where it stopped.
 
     Args:
-        folder: where to keep them until the evaluation is recorded.
-        key: of all that the scores depend on; another key finds nothing.
+        folder: folder that holds them until the evaluation is recorded.
+        key: everything that the scores depend on. Scores saved under another key are not found.
     """
 
     def __init__(self, folder: Path, *key: object) -> None:
         self.folder = folder / hashlib.sha256(repr(key).encode()).hexdigest()[:16]
 
     def read(self, first: int) -> Increments | None:
-        """Return the scores of the batch that begins with this sequence, None if it was not finished."""
+        """Return the scores of the batch that begins with sequence `first`, or None if they were not saved."""
         path = self._path(first)
         if not path.exists():
             return None
@@ -199,15 +199,15 @@ class PartialScores:
         return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
     def write(self, first: int, scores: Increments) -> None:
-        """Keep the scores of a batch."""
+        """Save the scores of the batch that begins with sequence `first`."""
         content = io.BytesIO()
         np.savez(content, **{name: values.numpy() for name, values in scores.items()})  # type: ignore[arg-type]
         replace_file(self._path(first), content.getvalue())
 
     def remove(self) -> None:
-        """Forget them, once the evaluation is recorded."""
+        """Delete the saved scores, once the evaluation is recorded."""
         shutil.rmtree(self.folder, ignore_errors=True)
-        with suppress(OSError):  # other evaluations have parts there
+        with suppress(OSError):  # not empty: other evaluations have saved scores there
             self.folder.parent.rmdir()
 
     def _path(self, first: int) -> Path:
@@ -225,38 +225,37 @@ def score_split(
     """Score every sequence.
 
     Args:
-        model: in eval mode; its device is where to compute.
-        batches: the index of the first sequence of each batch, and the batch on the CPU.
-        score: what to compute.
-        seed: of the noise, which depends on it and on the batches alone.
-        where: the model's and the split's name, for an error.
-        parts: what an interrupted evaluation has left, and where this one leaves its own.
+        model: model in eval mode. Scores are computed on its device.
+        batches: index of the first sequence of each batch, and the batch on the CPU.
+        score: scorer to apply.
+        seed: random seed for the noise, which depends on nothing else but the batches.
+        where: name of the model and the split, for error messages.
+        parts: scores saved by an interrupted evaluation; new ones are saved there too.
 
     Raises:
-        ForbesError: where a score is not finite (it names the sequence), or one sequence needs too much memory.
+        ForbesError: if a score is not finite (names the sequence), or if the memory does not suffice for one sequence.
     """
     device = next(model.parameters()).device
     found: list[Scores] = []
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        for first, batch in batches:
-            values = parts.read(first) if parts else None
-            if values is None:
-                values = _score(model, first, SequenceBatch(*(v.to(device) for v in batch)), score, seed, where)
-                require_finite(where, first, values)
-                if parts:
-                    parts.write(first, values)
-            counts = batch.mask.clone()  # (B, T)
-            counts[:, : score.context] = False
-            found.append(Scores(values, counts))
+    for first, batch in batches:
+        values = parts.read(first) if parts else None
+        if values is None:
+            values = _score(model, first, batch.to(device), score, seed, where)
+            require_finite(where, first, values)
+            if parts:
+                parts.write(first, values)
+        scored = batch.mask.clone()  # (B, T)
+        scored[:, : score.context] = False
+        found.append(Scores(values, scored))
     merged = {name: torch.cat([scores.values[name] for scores in found]) for name in score.metrics}  # (N, T)
     return Scores(merged, torch.cat([scores.mask for scores in found]))
 
 
 def _score(model: BeliefModel, first: int, batch: SequenceBatch, score: Scorer, seed: int, where: str) -> Increments:
-    """Score a batch; where the memory does not suffice, each half of it."""
-    torch.manual_seed(derive_seed(seed, "evaluation", first))
+    """Score a batch; if it does not fit into memory, score its halves."""
     try:
-        scores = score.function(model, batch)
+        with forked(batch.mask.device, derive_seed(seed, "evaluation", first)):
+            scores = score.function(model, batch)
         return {name: scores[name].cpu() for name in score.metrics}  # (B, T)
     except RuntimeError as error:
         if not _out_of_memory(error):
@@ -265,15 +264,15 @@ def _score(model: BeliefModel, first: int, batch: SequenceBatch, score: Scorer, 
     if half == 0:
         raise ForbesError(f"{where}: no memory for one sequence with {score.tag}. Choose fewer particles or samples")
     print(f"{where}: no memory for {len(batch.mask)} sequences at once, trying {half}", file=sys.stderr, flush=True)
-    parts = [
-        _score(model, first + skip, SequenceBatch(*(values[skip:][:count] for values in batch)), score, seed, where)
-        for skip, count in ((0, half), (half, len(batch.mask) - half))
-    ]
-    return {name: torch.cat([part[name] for part in parts]) for name in score.metrics}
+    halves = (
+        _score(model, first, batch.rows(slice(half)), score, seed, where),
+        _score(model, first + half, batch.rows(slice(half, None)), score, seed, where),
+    )
+    return {name: torch.cat([scores[name] for scores in halves]) for name in score.metrics}
 
 
 def _out_of_memory(error: RuntimeError) -> bool:
-    """Tell whether torch ran out of memory; on the CPU it has no class of its own for that."""
+    """Return whether torch ran out of memory. On the CPU there is no exception class for it."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
@@ -282,9 +281,9 @@ def require_finite(where: str, first: int, scores: Increments) -> None:
     for name, values in scores.items():
         broken = torch.nonzero(~values.isfinite().all(1))  # (n, 1)
         if len(broken):
-            place = int(broken[0])
+            row = int(broken[0])
             raise ForbesError(
-                f"{where}: the {name} of sequence {first + place} is {values[place].sum().item()}, expected a finite "
+                f"{where}: the {name} of sequence {first + row} is {values[row].sum().item()}, expected a finite "
                 "number. The training diverged: train again with a smaller learning_rate"
             )
 
@@ -292,7 +291,7 @@ def require_finite(where: str, first: int, scores: Increments) -> None:
 def with_progress(
     batches: Iterator[tuple[int, SequenceBatch]], name: str, sequences: int
 ) -> Iterator[tuple[int, SequenceBatch]]:
-    """Pass batches on, with a bar on a terminal and a line at each tenth elsewhere."""
+    """Yield the batches and show progress: a bar on a terminal, elsewhere a line per tenth."""
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(escape(name), total=sequences)

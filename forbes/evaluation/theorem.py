@@ -1,4 +1,4 @@
-r"""Theorem 1 of the paper, where everything is known: what the ELBO misses, and which belief it prefers.
+r"""Theorem 1 of the paper in closed form: the gap of the ELBO, and the belief that maximises it.
 
 .. math:: s_1 \sim N(0, P_1), \quad s_t = F s_{t-1} + N(0, Q), \quad o_t = s_t + N(0, R)
 
@@ -6,9 +6,10 @@ For a posterior :math:`q = \prod_t q_t(s_t \mid s_{t-1}, o)` the identity, in na
 
 .. math:: \log p(o_{1:T}) - \mathrm{ELBO} = E_q \sum_t \mathrm{KL}\big(q_t \,\|\, p(s_t \mid s_{t-1}, o_{t:T})\big).
 
-The paper has the filtering posterior :math:`p(s_t \mid o_{1:t})` in the last place; with that it does not hold.
-All is float64 and quadratic in s and o, so an expectation is a trace with the second moment of o, `(T, T)`: that of the
-process, `process.moment()`, gives the mean over :math:`o \sim p`; the outer product of one sequence, its own value.
+The paper has the filtering posterior :math:`p(s_t \mid o_{1:t})` as the last term, for which the identity does not
+hold. All is float64. Everything is quadratic in s and o, so an expectation is a trace with the second moment of o,
+`(T, T)`. With `process.moment()` it is the mean over :math:`o \sim p`; with the outer product of a sequence with
+itself, the value for that sequence.
 """
 
 import math
@@ -18,13 +19,13 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal, Normal
 
-__all__ = ["BeliefScores", "Conditional", "LinearGaussian", "belief_scores", "between", "elbo", "exact_filter"]
+__all__ = ["BeliefScores", "ClosedFormProcess", "Conditional", "belief_scores", "between", "elbo", "exact_filter"]
 __all__ += ["exact_one_step", "expected_kl", "factorised_optimum", "log_evidence", "sample_gap", "smoothing"]
 __all__ += ["structured_optimum"]
 
 
-class LinearGaussian(NamedTuple):
-    """The process; variances, not standard deviations."""
+class ClosedFormProcess(NamedTuple):
+    """Parameters of the process, with variances instead of standard deviations."""
 
     transition: float = 1.0
     """F."""
@@ -44,7 +45,7 @@ class LinearGaussian(NamedTuple):
         return noise
 
     def precision(self) -> Tensor:
-        """Return the inverse covariance of all of (s, o), `(2 T, 2 T)`."""
+        """Return the inverse covariance of (s, o) jointly, `(2 T, 2 T)`."""
         eye = torch.eye(self.steps, dtype=torch.float64)
         step = eye - self.transition * _shift(self.steps)  # step @ s is the process noise
         states = step.T @ torch.diag(1 / self.noise()) @ step  # (T, T)
@@ -52,7 +53,7 @@ class LinearGaussian(NamedTuple):
         return torch.cat((torch.cat((states + seen, -seen), 1), torch.cat((-seen, seen), 1)))  # (2 T, 2 T)
 
     def moment(self) -> Tensor:
-        """Return E[o o'] over the process, which is the covariance of o_1:T, `(T, T)`."""
+        """Return E[o o'], the covariance of o_1:T, `(T, T)`."""
         eye = torch.eye(self.steps, dtype=torch.float64)
         step = eye - self.transition * _shift(self.steps)
         paths: Tensor = torch.linalg.solve_triangular(step, eye, upper=False)  # s = paths @ noise
@@ -65,17 +66,17 @@ class Conditional(NamedTuple):
     carry: Tensor
     """a_t, `(T,)`; a_1 is 0."""
     gain: Tensor
-    """B, `(T, T)`; lower triangular where only the past is seen."""
+    """B, `(T, T)`; lower triangular if it depends on the past only."""
     variance: Tensor
     """v_t, `(T,)`."""
 
     def marginal(self) -> "Conditional":
-        """Integrate s_1:t-1 out: the belief q(s_t | o_1:T), which does not depend on s_{t-1}."""
+        """Integrate out s_1:t-1: return the belief q(s_t | o_1:T), which does not depend on s_{t-1}."""
         mean, spread = self._paths()
         return Conditional(torch.zeros_like(self.carry), mean, spread.square().sum(1))
 
     def joint_moment(self, moment: Tensor) -> Tensor:
-        """Return the second moment of (s, o) under q(s | o) and that of o, `(T, T)` to `(2 T, 2 T)`."""
+        """Return the second moment of (s, o), `(2 T, 2 T)`, under q(s | o) and the second moment of o, `(T, T)`."""
         mean, spread = self._paths()
         cross = mean @ moment
         states = cross @ mean.T + spread @ spread.T
@@ -95,16 +96,16 @@ def _shift(steps: int) -> Tensor:
     return torch.diag(torch.ones(steps - 1, dtype=torch.float64), -1)
 
 
-def log_evidence(process: LinearGaussian, moment: Tensor) -> Tensor:
-    """Average log p(o_1:T) in nats over observations of this second moment, as the sum of the exact predictions."""
+def log_evidence(process: ClosedFormProcess, moment: Tensor) -> Tensor:
+    """Return the mean of log p(o_1:T) in nats over observations with this second moment, by one-step predictions."""
     predicted = _predictive(process, exact_filter(process))
-    surprise = torch.eye(process.steps, dtype=torch.float64) - predicted.gain  # times o: what was not predicted
-    square = ((surprise @ moment) * surprise).sum(1)  # (T,)
+    innovation = torch.eye(process.steps, dtype=torch.float64) - predicted.gain  # times o: the prediction error
+    square = ((innovation @ moment) * innovation).sum(1)  # (T,)
     return -0.5 * ((2 * math.pi * predicted.variance).log() + square / predicted.variance).sum()
 
 
-def elbo(process: LinearGaussian, posterior: Conditional, moment: Tensor) -> Tensor:
-    """Average E_q[log p(s, o) - log q(s | o)] in nats over observations of this second moment."""
+def elbo(process: ClosedFormProcess, posterior: Conditional, moment: Tensor) -> Tensor:
+    """Return the mean of E_q[log p(s, o) - log q(s | o)] in nats over observations with this second moment."""
     square = (process.precision() * posterior.joint_moment(moment)).sum()
     constant = 2 * process.steps * math.log(2 * math.pi) + process.steps * math.log(process.observation_noise)
     entropy = 0.5 * (2 * math.pi * math.e * posterior.variance).log().sum()
@@ -112,7 +113,7 @@ def elbo(process: LinearGaussian, posterior: Conditional, moment: Tensor) -> Ten
 
 
 def expected_kl(posterior: Conditional, target: Conditional, moment: Tensor) -> Tensor:
-    r"""Average :math:`E_q \sum_t \mathrm{KL}(q_t \| p_t)` in nats; the right side, with `smoothing` for the target.
+    r"""Return the mean of :math:`E_q \sum_t \mathrm{KL}(q_t \| p_t)` in nats: the right side, for target `smoothing`.
 
     .. math:: \mathrm{KL}_t = \tfrac12\big(v/w - 1 - \log(v/w) + E[(\mu_q - \mu_p)^2]/w\big),
               \qquad v, w \text{ the variances of } q_t, p_t
@@ -124,15 +125,15 @@ def expected_kl(posterior: Conditional, target: Conditional, moment: Tensor) -> 
     return 0.5 * (ratio - 1 - ratio.log() + square / target.variance).sum()
 
 
-def exact_filter(process: LinearGaussian) -> Conditional:
-    """Return the exact belief p(s_t | o_1:t), the Kalman filter's; as a posterior it is independent over t."""
+def exact_filter(process: ClosedFormProcess) -> Conditional:
+    """Return the exact belief p(s_t | o_1:t) by the Kalman filter; as a posterior it is independent over t."""
     gains, variances = [], []
     gain = torch.zeros(process.steps, dtype=torch.float64)
     variance = torch.tensor(0.0, dtype=torch.float64)
-    for noise, own in zip(process.noise(), torch.eye(process.steps, dtype=torch.float64), strict=True):
+    for noise, current in zip(process.noise(), torch.eye(process.steps, dtype=torch.float64), strict=True):
         predicted = process.transition**2 * variance + noise
         weight = predicted / (predicted + process.observation_noise)
-        gain = (1 - weight) * process.transition * gain + weight * own
+        gain = (1 - weight) * process.transition * gain + weight * current
         variance = (1 - weight) * predicted
         gains.append(gain)
         variances.append(variance)
@@ -140,34 +141,35 @@ def exact_filter(process: LinearGaussian) -> Conditional:
     return Conditional(zero, torch.stack(gains), torch.stack(variances))
 
 
-def exact_one_step(process: LinearGaussian) -> Conditional:
-    """Return p(s_t | s_{t-1}, o_t), exact but for what later observations say."""
+def exact_one_step(process: ClosedFormProcess) -> Conditional:
+    """Return p(s_t | s_{t-1}, o_t), which is exact except that it ignores later observations."""
     zero = torch.zeros(process.steps, process.steps, dtype=torch.float64)
     return _with_future(process, zero[0], zero)
 
 
-def smoothing(process: LinearGaussian) -> Conditional:
+def smoothing(process: ClosedFormProcess) -> Conditional:
     """Return p(s_t | s_{t-1}, o_t:T), the true conditionals of the posterior p(s | o)."""
     return _with_future(process, *_future(process))
 
 
-def structured_optimum(process: LinearGaussian) -> Conditional:
-    """Return the q(s_t | s_{t-1}, o_1:t) of the highest ELBO.
+def structured_optimum(process: ClosedFormProcess) -> Conditional:
+    """Return the q(s_t | s_{t-1}, o_1:t) with the highest ELBO.
 
-    It is `smoothing` with E[o_u | o_1:t] for each later o_u: its variance is as small as if the future were known, its
-    mean does not know it, so it is over-confident. By the identity q_t is to minimise KL(q_t || p_t) averaged over the
-    future, and the average of log p_t is the log-density of this Gaussian. Later terms do not mind: both means have the
-    same share of s_t.
+    It is `smoothing` with each later o_u replaced by E[o_u | o_1:t]. Its variance is that of a posterior that knows the
+    future, its mean does not know the future, so it is over-confident. By the identity q_t minimises KL(q_t || p_t)
+    averaged over the future, and the average of log p_t is the log-density of this Gaussian up to a constant. Later
+    terms do not change: both means have the same coefficient of s_t.
     """
     precision, information = _future(process)
     time = torch.arange(process.steps)
-    ahead = process.transition ** (time - time[:, None]).clamp_min(0).double()  # E[o_u | o_1:t] is F^(u-t) the filter's
+    # E[o_u | o_1:t] = F^(u-t) E[s_t | o_1:t]
+    ahead = process.transition ** (time - time[:, None]).clamp_min(0).double()  # (T, T)
     weight = (information * ahead).sum(1, keepdim=True)  # (T, 1)
     return _with_future(process, precision, weight * exact_filter(process).gain)
 
 
-def _future(process: LinearGaussian) -> tuple[Tensor, Tensor]:
-    r"""Return J, `(T,)`, and H, `(T, T)`, what the future says of s_t.
+def _future(process: ClosedFormProcess) -> tuple[Tensor, Tensor]:
+    r"""Return J, `(T,)`, and H, `(T, T)`, the information of future observations about s_t.
 
     .. math:: p(o_{t+1:T} \mid s_t) \propto \exp(-J_t s_t^2 / 2 + s_t \sum_u H_{tu} o_u)
 
@@ -177,31 +179,31 @@ def _future(process: LinearGaussian) -> tuple[Tensor, Tensor]:
     precisions, rows = [], []
     precision = torch.tensor(0.0, dtype=torch.float64)
     row = torch.zeros(process.steps, dtype=torch.float64)
-    for own in torch.eye(process.steps, dtype=torch.float64).flip(0):
+    for current in torch.eye(process.steps, dtype=torch.float64).flip(0):
         precisions.append(precision)
         rows.append(row)
         spread = 1 + q * (precision + 1 / r)
-        row = process.transition * (row + own / r) / spread
+        row = process.transition * (row + current / r) / spread
         precision = process.transition**2 * (precision + 1 / r) / spread
     return torch.stack(precisions[::-1]), torch.stack(rows[::-1])  # (T,), (T, T)
 
 
-def _with_future(process: LinearGaussian, precision: Tensor, information: Tensor) -> Conditional:
+def _with_future(process: ClosedFormProcess, precision: Tensor, information: Tensor) -> Conditional:
     r"""Normalise :math:`p(s_t \mid s_{t-1})\, p(o_t \mid s_t)\, \exp(-J_t s_t^2 / 2 + s_t \sum_u H_{tu} o_u)`."""
     variance = 1 / (1 / process.noise() + 1 / process.observation_noise + precision)
     carry = variance * process.transition / process.noise()
     carry[0] = 0
-    own = torch.eye(process.steps, dtype=torch.float64) / process.observation_noise
-    return Conditional(carry, variance[:, None] * (own + information), variance)
+    current = torch.eye(process.steps, dtype=torch.float64) / process.observation_noise
+    return Conditional(carry, variance[:, None] * (current + information), variance)
 
 
-def factorised_optimum(process: LinearGaussian) -> Conditional:
-    r"""Return the q(s_t | o_1:t), independent over t, of the highest ELBO.
+def factorised_optimum(process: ClosedFormProcess) -> Conditional:
+    r"""Return the q(s_t | o_1:t), independent over t, with the highest ELBO.
 
     With L the precision of s given o, its variance is :math:`1 / L_{tt}`, that of s_t given both neighbours. Its mean
     solves :math:`L_{tt} m_t = F/Q\,(m_{t-1} + E[m_{t+1} \mid o_{1:t}]) + o_t/R`. With the filter's mean :math:`\mu_t`
-    that is :math:`m_t = \alpha_t \mu_t + \beta_t m_{t-1} + \gamma_t o_t`, coefficients backwards, since given the past
-    both :math:`\mu_{t+1}` and :math:`o_{t+1}` are :math:`F \mu_t` on average.
+    this is :math:`m_t = \alpha_t \mu_t + \beta_t m_{t-1} + \gamma_t o_t`. The coefficients follow by a backward
+    recursion, since given the past both :math:`\mu_{t+1}` and :math:`o_{t+1}` have the mean :math:`F \mu_t`.
     """
     diagonal = process.precision().diagonal()[: process.steps]  # (T,)
     link = process.transition / process.process_noise
@@ -213,25 +215,25 @@ def factorised_optimum(process: LinearGaussian) -> Conditional:
         beta, gamma = link / rest, 1 / (process.observation_noise * rest)
         coefficients.append((alpha, beta, gamma))
     rows, row = [], torch.zeros(process.steps, dtype=torch.float64)  # m_0 = 0
-    own = torch.eye(process.steps, dtype=torch.float64)
-    for (alpha, beta, gamma), mean, one in zip(coefficients[::-1], exact_filter(process).gain, own, strict=True):
-        row = alpha * mean + beta * row + gamma * one
+    eye = torch.eye(process.steps, dtype=torch.float64)
+    for (alpha, beta, gamma), mean, current in zip(coefficients[::-1], exact_filter(process).gain, eye, strict=True):
+        row = alpha * mean + beta * row + gamma * current
         rows.append(row)
     return Conditional(torch.zeros_like(diagonal), torch.stack(rows), 1 / diagonal)
 
 
-def between(first: Conditional, second: Conditional, share: float) -> Conditional:
-    """Go from one posterior to another: a and B on a straight line, v on one in its logarithm.
+def between(first: Conditional, second: Conditional, fraction: float) -> Conditional:
+    """Interpolate between two posteriors: linearly in a and B, log-linearly in v.
 
-    Between two that are independent over t the ELBO is concave, so towards its optimum it only rises.
+    Between two posteriors that are independent over t the ELBO is concave, so it rises monotonically to its optimum.
     """
-    log_variance = torch.lerp(first.variance.log(), second.variance.log(), share)
-    carry, gain = torch.lerp(first.carry, second.carry, share), torch.lerp(first.gain, second.gain, share)
+    log_variance = torch.lerp(first.variance.log(), second.variance.log(), fraction)
+    carry, gain = torch.lerp(first.carry, second.carry, fraction), torch.lerp(first.gain, second.gain, fraction)
     return Conditional(carry, gain, log_variance.exp())
 
 
 class BeliefScores(NamedTuple):
-    """What a posterior is worth: the first by its ELBO, the others as a belief q(s_t | o_1:t); means over o ~ p."""
+    """Scores of a posterior by its ELBO, and of its marginals as beliefs q(s_t | o_1:t); means over o ~ p."""
 
     elbo_gap: float
     """log p - ELBO, nats per sequence."""
@@ -247,8 +249,8 @@ class BeliefScores(NamedTuple):
     """Probability that the belief's central 90 % hold the true state, at the middle step."""
 
 
-def belief_scores(process: LinearGaussian, posterior: Conditional) -> BeliefScores:
-    r"""Score a posterior that sees the past only, in closed form.
+def belief_scores(process: ClosedFormProcess, posterior: Conditional) -> BeliefScores:
+    r"""Score a posterior that depends on the past only, in closed form.
 
     The true state is :math:`N(\mu_t, P_t)` given o_1:t, so its distance from a belief's mean m has variance
     :math:`P_t + E[(\mu_t - m_t)^2]`. The deficit is the sum of KL(true predictive density || the belief's).
@@ -269,15 +271,15 @@ def belief_scores(process: LinearGaussian, posterior: Conditional) -> BeliefScor
     )
 
 
-def _predictive(process: LinearGaussian, belief: Conditional) -> Conditional:
+def _predictive(process: ClosedFormProcess, belief: Conditional) -> Conditional:
     """Return the belief's densities of the next observation, p(o_t | belief at t - 1)."""
     before = _shift(process.steps)
     spread = process.transition**2 * before @ belief.variance + process.noise() + process.observation_noise  # (T,)
     return Conditional(belief.carry, process.transition * before @ belief.gain, spread)
 
 
-def sample_gap(process: LinearGaussian, posterior: Conditional, samples: int, generator: torch.Generator) -> Tensor:
-    """Draw o from the process and s from q(s | o), and give log p(o) - log p(s, o) + log q(s | o) in nats, `(N,)`."""
+def sample_gap(process: ClosedFormProcess, posterior: Conditional, samples: int, generator: torch.Generator) -> Tensor:
+    """Sample o from the process and s from q(s | o); return log p(o) - log p(s, o) + log q(s | o) in nats, `(N,)`."""
     noise = torch.randn(3, process.steps, samples, generator=generator, dtype=torch.float64)
     state, observations = torch.zeros(samples, dtype=torch.float64), []
     for variance, step, seen in zip(process.noise(), *noise[:2], strict=True):
@@ -290,8 +292,8 @@ def sample_gap(process: LinearGaussian, posterior: Conditional, samples: int, ge
     means = observation @ posterior.gain.T  # (N, T)
     for time, variance in enumerate(process.noise()):
         prior = Normal(process.transition * state, variance.sqrt())
-        own = Normal(means[:, time] + posterior.carry[time] * state, posterior.variance[time].sqrt())
-        state = own.mean + own.stddev * noise[2, time]
+        q = Normal(means[:, time] + posterior.carry[time] * state, posterior.variance[time].sqrt())
+        state = q.mean + q.stddev * noise[2, time]
         likelihood = Normal(state, math.sqrt(process.observation_noise)).log_prob(observation[:, time])
-        gap = gap + own.log_prob(state) - prior.log_prob(state) - likelihood
+        gap = gap + q.log_prob(state) - prior.log_prob(state) - likelihood
     return gap

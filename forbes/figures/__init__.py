@@ -1,1 +1,1 @@
-"""Figures: one function per figure of the paper, and the style that all share."""
+"""Figures: one function per figure, and their common style."""

@@ -1,4 +1,4 @@
-"""Calibration of beliefs in one picture: ranks as a histogram, their distribution function, and coverage."""
+"""Draw the calibration of beliefs: histogram of ranks, their distribution function, and coverage."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -29,20 +29,20 @@ class RankedBelief(NamedTuple):
     name: str
     colour: str
     value_ranks: Tensor
-    """Of the values, `(N, D)`: a line for each dimension."""
+    """Ranks of the values, `(N, D)`, drawn as one line per dimension."""
     density_ranks: Tensor
-    """Of their log-densities, `(N,)`."""
+    """Ranks of their log-densities, `(N,)`."""
 
 
 def calibration(beliefs: Sequence[RankedBelief], samples: int) -> Figure:
-    """Draw the ranks' histogram, what their distribution function is off by, and the coverage of each belief.
+    """Draw the histogram of ranks, the deviation of their distribution function, and the coverage of each belief.
 
-    The bands are those of a calibrated belief: in 95 of 100 pictures all of the histogram lies in its band, and so does
-    all of the second panel; the third's holds at each level by itself.
+    The bands are those of a calibrated belief at 95 %. In the first two panels a band holds for the whole curve, in the
+    third for each level separately.
 
     Args:
-        beliefs: a colour each, with equally many ranks.
-        samples: L.
+        beliefs: beliefs with the same number of ranks.
+        samples: number of samples that were ranked, L.
     """
     count = len(beliefs[0].density_ranks)
     for belief in beliefs:
@@ -64,25 +64,25 @@ def calibration(beliefs: Sequence[RankedBelief], samples: int) -> Figure:
 
 
 def _draw_histogram(axes: Axes, beliefs: Sequence[RankedBelief], count: int, samples: int) -> None:
-    """Draw the density of ranks; its band holds all bins together (Bonferroni: bins hardly depend on each other)."""
+    """Draw the density of ranks, with a simultaneous band for all bins (Bonferroni, as bins are nearly independent)."""
     bins = min(_BINS, samples + 1)
     bin_of = torch.arange(samples + 1) * bins // (samples + 1)  # (L + 1,)
-    share = bin_of.bincount() / (samples + 1)  # (bins,), nearly equal
-    edges = torch.nn.functional.pad(share.cumsum(0), (1, 0)).tolist()
-    low, high = binomial_interval(count, share, 1 - (1 - _CONFIDENCE) / bins)
-    axes.stairs((high / share).tolist(), edges, baseline=(low / share).tolist(), fill=True, color=GREY, alpha=0.3, lw=0)
+    width = bin_of.bincount() / (samples + 1)  # (bins,), nearly equal
+    edges = torch.nn.functional.pad(width.cumsum(0), (1, 0)).tolist()
+    low, high = binomial_interval(count, width, 1 - (1 - _CONFIDENCE) / bins)
+    axes.stairs((high / width).tolist(), edges, baseline=(low / width).tolist(), fill=True, color=GREY, alpha=0.3, lw=0)
     axes.axhline(1, color=BLACK, lw=0.6)
     for belief in beliefs:
         for ranks in belief.value_ranks.T:
-            density = bin_of[ranks].bincount(minlength=bins) / count / share  # (bins,)
+            density = bin_of[ranks].bincount(minlength=bins) / count / width  # (bins,)
             axes.stairs(density.tolist(), edges, color=belief.colour, alpha=_alpha(belief), baseline=None)
     axes.set(xlabel="rank of the true value / L", ylabel="density of ranks", xlim=(0, 1))
     axes.set_ylim(bottom=0)
 
 
 def _draw_difference(axes: Axes, beliefs: Sequence[RankedBelief], count: int, samples: int) -> None:
-    """Draw the ranks' distribution function less that of uniform ranks."""
-    uniform = torch.linspace(0, 1, samples + 2, dtype=torch.float64)  # (L + 2,), the share below rank 0, 1, ..., L + 1
+    """Draw the distribution function of the ranks minus that of uniform ranks."""
+    uniform = torch.linspace(0, 1, samples + 2, dtype=torch.float64)  # (L + 2,), P(rank < 0), ..., P(rank < L + 1)
     low, high = ecdf_band(count, samples, _CONFIDENCE, generator(0, "calibration figure", count))
     low, high = (torch.cat((uniform[:1], end, uniform[-1:])) - uniform for end in (low, high))  # (L + 2,)
     axes.fill_between(uniform, low, high, color=GREY, alpha=0.3, lw=0)
@@ -95,17 +95,17 @@ def _draw_difference(axes: Axes, beliefs: Sequence[RankedBelief], count: int, sa
 
 
 def _draw_coverage(axes: Axes, beliefs: Sequence[RankedBelief], count: int, samples: int) -> None:
-    """Draw how often the true value lies in the highest-density region of each level."""
+    """Draw the coverage of the highest-density regions."""
     levels = torch.linspace(0, 1, _LEVELS, dtype=torch.float64)
     low, high = binomial_interval(count, levels, _CONFIDENCE)
     axes.fill_between(levels, low, high, color=GREY, alpha=0.3, lw=0)
     axes.plot([0, 1], [0, 1], color=BLACK, lw=0.6)
     for belief in beliefs:
         axes.plot(levels, coverage(belief.density_ranks, samples, levels), color=belief.colour)
-    axes.set(xlabel="nominal level of the region", ylabel="true values within", xlim=(0, 1), ylim=(0, 1))
+    axes.set(xlabel="nominal level of the region", ylabel="true values inside", xlim=(0, 1), ylim=(0, 1))
     axes.set_aspect("equal")
 
 
 def _alpha(belief: RankedBelief) -> float:
-    """Make many lines fainter."""
+    """Return the opacity of the lines: the more dimensions, the fainter."""
     return max(0.3, 1 / belief.value_ranks.shape[1])

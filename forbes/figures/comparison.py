@@ -1,4 +1,4 @@
-"""Families side by side in three pictures: their scores, their scores at each step, and who wins by which score."""
+"""Compare families in three figures: scores, scores per step, and differences by score."""
 
 import math
 from collections.abc import Sequence
@@ -13,19 +13,19 @@ from forbes.evaluation.comparison import Comparison
 from forbes.evaluation.metrics import SCORES, score_of
 from forbes.figures.style import COLUMN, GREY, PAGE, PALETTE, draw_references, paper_style
 
-__all__ = ["differences", "per_step", "scores"]
+__all__ = ["draw_differences", "draw_per_step", "draw_scores"]
 
 _PER_STEP = ("elbo", "pll", "open_loop_marginal", "degradation", "ess")
-"""Scores whose value at a step means something by itself."""
-_FAR = 5  # times the range of the others
+"""Scores that are meaningful at a single step."""
+_FAR = 5  # distance of an outlier, in multiples of the range of the other families
 
 
-def scores(comparison: Comparison) -> Figure:
-    """Draw each score in a panel: a dot for each seed with its standard error, a bar at the mean over seeds.
+def draw_scores(comparison: Comparison) -> Figure:
+    """Draw each score in a panel: one dot per seed with its standard error, and a bar at the mean over seeds.
 
-    The line of a family that does not have the score stays empty. A family so far below the others that they would
-    fall on one spot is beyond the left edge, with its mean in words. Where the likelihood is known it is a dashed line;
-    dotted ones are models without a belief.
+    The line of a family without the score stays empty. A family far below the others is not drawn to scale: its mean is
+    printed at the left edge. A dashed line is the exact log-likelihood, if known; dotted lines are models without a
+    belief.
     """
     table = comparison.scores
     known = table[[score_of(metric) == "log_p" for metric in table["metric"]]]["mean"].mean()
@@ -44,7 +44,7 @@ def scores(comparison: Comparison) -> Figure:
             axes.set_title(_in_lines(metric))
             axes.margins(x=0.15)
             dotted |= draw_references(axes, comparison.references.get(metric, {}), along="x")
-            axes.locator_params(axis="x", nbins=4)  # more labels than that touch
+            axes.locator_params(axis="x", nbins=4)  # more labels would touch
         for axes in panels[len(metrics) :]:
             axes.remove()
         panels[0].set_yticks(range(len(families)), families)
@@ -52,36 +52,36 @@ def scores(comparison: Comparison) -> Figure:
         dashed = "" if np.isnan(known) else ", dashed: the exact log p, which no bound exceeds"
         names = list(next(iter(comparison.references.values()), {}))
         below = f", dotted: models without a belief, {names[0]} to {names[-1]}" if dotted else ""
-        figure.supxlabel(f"nats per sequence, more is better{dashed}{below}", fontsize=8)
+        figure.supxlabel(f"nats per sequence, higher is better{dashed}{below}", fontsize=8)
     return figure
 
 
 def _draw_score(axes: Axes, of_metric: pd.DataFrame, families: Sequence[str]) -> None:
     near = _near(of_metric.groupby("family", sort=False)["mean"].mean().dropna())
-    for place, (name, colour) in enumerate(zip(families, cycle(PALETTE), strict=False)):
-        own = of_metric[of_metric["family"] == name]
-        mean = own["mean"].mean()
+    for y, (name, colour) in enumerate(zip(families, cycle(PALETTE), strict=False)):
+        seeds = of_metric[of_metric["family"] == name]
+        mean = seeds["mean"].mean()
         if name in near:
-            heights = place + 0.3 * (np.arange(1, len(own) + 1) / (len(own) + 1) - 0.5)
-            axes.errorbar(own["mean"], heights, xerr=own["standard_error"], fmt=".", color=colour, elinewidth=0.8)
-            axes.plot([mean] * 2, [place - 0.35, place + 0.35], color=colour)
+            heights = y + 0.3 * (np.arange(1, len(seeds) + 1) / (len(seeds) + 1) - 0.5)
+            axes.errorbar(seeds["mean"], heights, xerr=seeds["standard_error"], fmt=".", color=colour, elinewidth=0.8)
+            axes.plot([mean] * 2, [y - 0.35, y + 0.35], color=colour)
         elif not np.isnan(mean):
             at_edge = axes.get_yaxis_transform()
             axes.text(
-                0.02, place, f"← {mean:.1f}".replace("-", "−"), transform=at_edge, va="center", color=colour, fontsize=7
+                0.02, y, f"← {mean:.1f}".replace("-", "−"), transform=at_edge, va="center", color=colour, fontsize=7
             )
 
 
 def _near(means: pd.Series) -> list[str]:
-    """Name the families that share an axis: the last is left out while without it the others, 3 or more, fill it."""
+    """Return the families to draw to scale: the lowest is dropped while it is far below the others, at least 3."""
     ordered = means.sort_values(ascending=False)
     while len(ordered) > 3 and ordered.iloc[0] - ordered.iloc[-1] > _FAR * (ordered.iloc[0] - ordered.iloc[-2]):
         ordered = ordered.iloc[:-1]
     return list(ordered.index)
 
 
-def per_step(comparison: Comparison) -> Figure | None:
-    """Draw the mean of each step over sequences and seeds, a panel for each score that has one; None without any."""
+def draw_per_step(comparison: Comparison) -> Figure | None:
+    """Draw the mean at each step over sequences and seeds, one panel per score; None if no score has steps."""
     metrics = [metric for metric in comparison.curves if score_of(metric) in _PER_STEP]
     if not metrics:
         return None
@@ -95,7 +95,7 @@ def per_step(comparison: Comparison) -> Figure | None:
             _draw_steps(axes, comparison.curves[metric], metric, colours)
         for axes in panels[len(metrics) :]:
             axes.remove()
-        lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}  # some lack some families
+        lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}  # not all panels have all
         named = {name: lines[name] for name in colours if name in lines}
         figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=4 if columns > 1 else 2)
     return figure
@@ -108,13 +108,13 @@ def _draw_steps(axes: Axes, curves: dict[str, list[float]], metric: str, colours
         axes.plot(steps[shown], np.asarray(curve)[shown], color=colours[name], label=name)
     axes.set_title(_in_lines(metric))
     axes.set_xlabel("step")
-    axes.set_ylabel("share of K" if score_of(metric) == "ess" else "nats")
+    axes.set_ylabel("fraction of K" if score_of(metric) == "ess" else "nats")
 
 
-def differences(comparison: Comparison, first: str) -> Figure:
-    """Draw the mean difference to the first family, families × scores; colours compare within a column.
+def draw_differences(comparison: Comparison, first: str) -> Figure:
+    """Draw the mean difference to the first family as a table of families and scores, coloured within each column.
 
-    A cell says n/a where one of the two does not have the score.
+    A cell is n/a if one of the two families does not have the score.
     """
     table = comparison.differences.groupby(["family", "metric"], sort=False)["mean"].mean().unstack(sort=False)
     values = table.to_numpy()  # (families, scores)
@@ -127,13 +127,13 @@ def differences(comparison: Comparison, first: str) -> Figure:
             axes.text(column, row, "n/a" if np.isnan(value) else f"{value:+.2f}", ha="center", va="center")
         axes.set_xticks(range(len(table.columns)), [_in_lines(metric) for metric in table.columns])
         axes.set_yticks(range(len(table)), table.index)
-        axes.set_title(f"nats per sequence more than {first}, paired, mean over seeds")
+        axes.set_title(f"difference to {first} in nats per sequence, paired, mean over seeds")
         axes.grid(visible=False)
     return figure
 
 
 def _in_lines(metric: str) -> str:
-    """Break `test[:1000]/pll[bernoulli,K=128]` into the score, the split and the numbers."""
+    """Break a name such as `test[:1000]/pll[bernoulli,K=128]` into lines for score, split and tag."""
     split, _, rest = metric.partition("/")
     score, _, tag = rest.partition("[")
     return f"{score}\n{split}\n[{tag}"

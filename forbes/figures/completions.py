@@ -1,4 +1,4 @@
-"""Completions of digits in pictures: what is drawn and its class, the scores, and the error of the best of n."""
+"""Figures of digit completions: drawings with their classes, scores, and the error of the best of n."""
 
 from collections.abc import Sequence
 from itertools import chain, cycle
@@ -19,34 +19,34 @@ from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Bars, Panel, draw_bands
 from forbes.figures.style import BLACK, GREY, PAGE, PALETTE, paper_style
 from forbes.models import BeliefModel
-from forbes.seeding import derive_seed
+from forbes.seeding import derive_seed, forked
 
-__all__ = ["by_ambiguity", "drawings", "errors", "scores"]
+__all__ = ["by_ambiguity", "draw_class_scores", "draw_completions", "draw_errors"]
 
 _SHOWN = 5
-"""Completions of each digit."""
+"""Number of completions drawn per digit."""
 _SIDE_BY_SIDE = 2
-"""Models; further ones are drawn below, beside the same digits."""
-_LEGEND = 5  # names in a line
-_SCORES = {  # of the class, with the rows that are no model's
+"""Number of models next to each other; further models are drawn below."""
+_LEGEND = 5  # entries per line
+_SCORES = {  # scores of the class, with the rows for comparison
     "js[end]": ("JS to the reference, nats", ("similar",)),
     "entropy[end]": ("entropy of the class, nats", ("similar", "reference")),
     "nll[end]": ("−log p of the label, nats", ("similar", "reference")),
-    "clear[end]": ("share of clear digits", ("similar", "truth")),
+    "clear[end]": ("fraction of clear digits", ("similar", "truth")),
 }
 _LINES = {"similar": ":", "reference": "--", "truth": "-."}
 
 
 def by_ambiguity(reference: Tensor, count: int) -> Tensor:
-    """Choose digits at equal distances in the order of their entropy under the reference, `(B, 10)`, the highest first.
+    """Return digits evenly spaced in decreasing order of their entropy under the reference, `(B, 10)`.
 
-    No model has a say in the choice; `(count,)`, int64, or fewer where there are fewer digits.
+    The choice does not depend on any model. The result is `(count,)`, int64, or fewer if there are fewer digits.
     """
     order = entropy(reference).argsort(descending=True, stable=True)  # (B,)
     return order[torch.linspace(0, len(order) - 1, min(count, len(order))).round().long()]
 
 
-def drawings(
+def draw_completions(
     study: Study,
     models: Sequence[BeliefModel],
     source: SequenceSource,
@@ -54,17 +54,17 @@ def drawings(
     place: Tensor,
     seed: int,
 ) -> Figure:
-    """Draw beginnings from the most to the least ambiguous, with completions and the classes that these show.
+    """Draw prefixes from the most to the least ambiguous, with completions and their class distribution.
 
-    Two models beside each other, further ones below.
+    Two models are drawn next to each other, further ones below.
 
     Args:
-        study: of one length of the prefix.
-        models: of its runs.
-        source: of the digits.
-        batch: the digits to draw, up to the end of the longest.
-        place: of them among the prefixes of the study, `(R,)`.
-        seed: of the completions.
+        study: results for one length of the prefix.
+        models: models of its runs.
+        source: source of the digits.
+        batch: digits to draw, up to the end of the longest.
+        place: position of each digit among the prefixes of the study, `(R,)`.
+        seed: random seed for the completions.
     """
     context, end = study.prefixes.context, study.prefixes.steps[place]  # (R,)
     digit = torch.arange(len(place))
@@ -72,26 +72,25 @@ def drawings(
     truth, seen = (pictures[digit, step - 1][:, None].float() for step in (end, torch.full_like(end, context)))
     reference = study.reference.classes[place].numpy()  # (R, 10)
     ambiguity = [f"H = {value:.2f}" for value in study.reference.scores["entropy[end]"][place].tolist()]
-    beginnings: list[Panel | Bars] = [
+    prefix_panels: list[Panel | Bars] = [
         Panel("truth", truth, BLACK, ["end"]),
         Panel("seen", seen, GREY, [f"t={context}"]),
         Bars("reference", reference, GREY, notes=ambiguity),
     ]
     of_models: list[list[Panel | Bars]] = []
     for row, model, colour in zip(study.runs, models, cycle(PALETTE), strict=False):
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(derive_seed(seed, "drawings", context))
+        with forked("cpu", derive_seed(seed, "drawings", context)):
             completions = complete(model, source, batch, context, _SHOWN)
         frames = completions.frames[:, digit, end - context - 1]  # (S, R, 1, H, W)
         notes = [f"JS = {value:.2f}" for value in row.scores["js[end]"][place].tolist()]
         classes = Bars("their classes", row.classes[place].numpy(), colour, reference, notes)
         of_models.append([Panel(row.name, frames.transpose(0, 1), colour), classes])
     pairs = [of_models[first : first + _SIDE_BY_SIDE] for first in range(0, len(of_models), _SIDE_BY_SIDE)]
-    return draw_bands([[*beginnings, *chain(*pair)] for pair in pairs])
+    return draw_bands([[*prefix_panels, *chain(*pair)] for pair in pairs])
 
 
-def scores(studies: Sequence[Study]) -> Figure:
-    """Draw scores of the class against the length of the beginning, with standard errors over digits."""
+def draw_class_scores(studies: Sequence[Study]) -> Figure:
+    """Draw scores of the class against the length of the prefix, with standard errors over digits."""
     with paper_style():
         figure = Figure((PAGE, 2.1), layout="constrained")
         panels = figure.subplots(1, len(_SCORES))
@@ -117,8 +116,8 @@ def _draw_line(axes: Axes, studies: Sequence[Study], rows: Sequence[Row], score:
     axes.errorbar(steps, means, widths, fmt=f".{line}", color=colour, label=rows[0].name, capsize=2, markersize=3)
 
 
-def errors(studies: Sequence[Study]) -> Figure:
-    """Draw the error of the best of n completions (lines) and of their average picture (dashed) against n."""
+def draw_errors(studies: Sequence[Study]) -> Figure:
+    """Draw the error of the best of n completions (solid) and of their average image (dashed) against n."""
     with paper_style():
         figure = Figure((PAGE, 2.3), layout="constrained")
         panels = figure.subplots(1, len(studies), squeeze=False, sharey=True)[0]

@@ -1,4 +1,4 @@
-"""Episodes of images: strips of their frames."""
+"""Draw episodes as strips of frames."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -14,21 +14,22 @@ __all__ = ["MAX_CHANNELS", "draw_strips", "to_rgb"]
 T = TypeVar("T", bound=np.generic)
 
 MAX_CHANNELS = 4
-"""Of a frame that pictures can show."""
+"""Maximal number of channels of a frame that can be drawn."""
 _FRAMES = 10
 
 
 def to_rgb(frames: NDArray[T]) -> NDArray[T]:
-    """Return frames `(*, C, H, W)` in three colours, `(*, 3, H, W)`: any type and range of numbers.
+    """Convert frames `(*, C, H, W)` of any dtype and range to three colours, `(*, 3, H, W)`.
 
-    One channel is grey; two are red and cyan, so white stays white; the last of four (opacity, or depth) is left out.
+    One channel is grey. Two channels are red and cyan, so white stays white. The last of four channels (opacity or
+    depth) is dropped.
     """
     shown = {1: [0, 0, 0], 2: [0, 1, 1]}.get(frames.shape[-3], [0, 1, 2])
     return frames[..., shown, :, :]  # (*, 3, H, W)
 
 
 def draw_strips(episodes: Sequence[tuple[str, Episode]]) -> Figure:
-    """Draw a row for each episode of images: ten frames, evenly spaced from its first to its last, with their time."""
+    """Draw one row per episode: ten frames, evenly spaced from the first to the last, with their time."""
     figure = Figure(figsize=(1.0 * _FRAMES, 1.25 * len(episodes)), layout="constrained")
     axes = figure.subplots(len(episodes), _FRAMES, squeeze=False)
     for row, (name, episode) in zip(axes, episodes, strict=True):

@@ -1,4 +1,4 @@
-"""Grids of frames: truth, what a model saw, and what it expects, side by side (paper, Figure 4)."""
+"""Grids of frames: truth, observed frames and predictions (paper, Figure 4)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,13 +13,14 @@ from torch import Tensor
 from forbes.errors import ForbesError
 from forbes.figures.episodes import MAX_CHANNELS, to_rgb
 from forbes.figures.style import BLACK, GREY, PAGE, paper_style
+from forbes.rounding import ceil_div
 
-__all__ = ["Bars", "Panel", "draw_bands", "draw_panels", "require_images", "seen_panel", "truth_panel"]
+__all__ = ["Bars", "Panel", "draw_bands", "draw_panels", "require_images", "seen_panel", "seen_steps", "truth_panel"]
 
 _GAP = 2  # pixels between the frames of a panel
 _GAP_COLOUR = 0.86
 _BARS_COLUMNS = 3
-"""A row of bars is as wide as so many frames."""
+"""Width of a row of bars, in frames."""
 
 
 class Panel(NamedTuple):
@@ -27,41 +28,46 @@ class Panel(NamedTuple):
 
     title: str
     images: Tensor
-    """Values in [0, 1], rows × columns: `(R, K, C, H, W)`; `to_rgb` says how C channels are shown."""
+    """Values in [0, 1] for R rows and K columns, `(R, K, C, H, W)`, drawn by `to_rgb`."""
     colour: str
-    """Of the ink, where the frames are grey."""
+    """Colour of the ink of grey frames."""
     labels: Sequence[str] = ()
-    """One for each column, below it."""
+    """Labels below the columns."""
     names: Sequence[str] = ()
-    """One for each row, at its left; in every band, or in none."""
+    """Labels on the left of the rows; in every band, or in none."""
 
 
 class Bars(NamedTuple):
-    """Probabilities as bars, a row beside each row of frames."""
+    """Probabilities as bars, one row for each row of frames."""
 
     title: str
     shares: NDArray[np.float64]
-    """In [0, 1], rows × values: `(R, V)`."""
+    """Probabilities of V values in R rows, `(R, V)`."""
     colour: str
     behind: NDArray[np.float64] | None = None
-    """Others to compare with, `(R, V)`, drawn as a grey area."""
+    """Probabilities to compare with, `(R, V)`, drawn as a grey area."""
     notes: Sequence[str] = ()
-    """One for each row, above its bars."""
+    """Notes above the bars of each row."""
 
 
 def truth_panel(observation: Tensor, times: Sequence[int]) -> Panel:
-    """Show sequences `(B, T, C, H, W)` at some steps, counted from 1."""
+    """Return a panel of sequences `(B, T, C, H, W)` at some steps, counted from 1."""
     return Panel("truth", _frames(observation, times), BLACK, [f"t={time}" for time in times])
 
 
 def seen_panel(observation: Tensor, context: int) -> Panel:
-    """Show three of the frames that a model sees."""
-    times = sorted({-(-context * part // 3) for part in (1, 2, 3)})
+    """Return a panel of three of the frames that a model sees."""
+    times = seen_steps(context)
     return Panel("seen", _frames(observation, times), GREY, [f"t={time}" for time in times])
 
 
+def seen_steps(context: int) -> list[int]:
+    """Return up to three steps of the context, counted from 1, evenly spaced to its last."""
+    return sorted({ceil_div(context * part, 3) for part in (1, 2, 3)})
+
+
 def require_images(where: str, shape: Sequence[int], remedy: str) -> None:
-    """Raise a ForbesError, ended by what to do, unless observations of this shape are images that `to_rgb` can show."""
+    """Raise a ForbesError, with this remedy, unless observations of this shape are images that `to_rgb` can convert."""
     if len(shape) != 3 or not 1 <= shape[0] <= MAX_CHANNELS:
         found = f"vectors of {shape[0]}" if len(shape) == 1 else f"of shape {tuple(shape)}"
         raise ForbesError(
@@ -70,21 +76,21 @@ def require_images(where: str, shape: Sequence[int], remedy: str) -> None:
 
 
 def _frames(observation: Tensor, times: Sequence[int]) -> Tensor:
-    """Pick steps, counted from 1, and scale what is stored to [0, 1]: `(B, T, C, H, W)` to `(B, K, C, H, W)`."""
+    """Return K steps, counted from 1, scaled to [0, 1]: `(B, T, C, H, W)` to `(B, K, C, H, W)`."""
     grey = observation.float() / observation.max().clamp(min=1)
     return grey[:, [time - 1 for time in times]]
 
 
 def draw_panels(panels: Sequence[Panel | Bars], width: float = PAGE) -> Figure:
-    """Draw panels of equal rows beside each other, all frames of the same size; the first one has frames."""
+    """Draw panels with the same number of rows next to each other. The first has frames; all frames have one size."""
     return draw_bands([panels], width)
 
 
 def draw_bands(bands: Sequence[Sequence[Panel | Bars]], width: float = PAGE) -> Figure:
-    """Draw panels beside each other in bands under each other.
+    """Draw bands of panels below each other.
 
-    Those of a band have equal rows, all bands columns; the last may have fewer panels. A band with titles, or labels,
-    has room for them.
+    The panels of a band have the same number of rows, and all bands the same columns; the last band may have fewer
+    panels.
     """
     first = [_first(band) for band in bands]
     height, wide = first[0].images.shape[3:]
@@ -136,7 +142,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
 
 
 def _draw_bars(axes: Axes, bars: Bars) -> None:
-    """Draw row r between the heights R - r - 1 and R - r; a share of 1 leaves room for the note."""
+    """Draw row r between the heights R - r - 1 and R - r, with space for the note above a probability of 1."""
     rows, values = bars.shares.shape
     edges, full = np.arange(values + 1) - 0.5, 0.62
     for row in range(rows):
@@ -156,7 +162,7 @@ def _draw_bars(axes: Axes, bars: Bars) -> None:
 
 
 def _mosaic(images: Tensor, colour: str) -> NDArray[np.float32]:
-    """Paint frames in ink on white, side by side: `(R, K, C, H, W)` to `(R (H + gap) + gap, K (W + gap) + gap, 3)`."""
+    """Arrange frames, in ink on white: `(R, K, C, H, W)` to `(R (H + gap) + gap, K (W + gap) + gap, 3)`."""
     rows, columns, channels, height, width = images.shape
     values = images.detach().float().cpu().numpy()
     if channels == 1:

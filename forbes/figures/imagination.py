@@ -1,4 +1,4 @@
-"""What a model of images expects: open loop against the truth, and several futures of one belief."""
+"""Figures of a model's imagination: open loop against the truth, and several futures of one belief."""
 
 from collections.abc import Sequence
 
@@ -6,31 +6,31 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.figures.grids import Panel, draw_bands
+from forbes.figures.grids import Panel, draw_bands, seen_steps
 from forbes.figures.style import BLACK, BLUE, GREY
 
-__all__ = ["imagined_futures", "open_loop"]
+__all__ = ["draw_futures", "draw_open_loop"]
 
 
-def open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, columns: int) -> Figure:
-    r"""Draw truth, model and error of some sequences over time: the frames seen, and the frames imagined.
+def draw_open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, columns: int) -> Figure:
+    r"""Draw truth, model and error of some sequences over time, for observed and imagined frames.
 
     .. math:: \text{error} = \tfrac12 + \tfrac12 (\text{model} - \text{truth})
 
-    so an error of 0 is the grey in the middle.
+    so an error of 0 is medium grey.
 
     Args:
-        truth: values in [0, 1], `(B, T, C, H, W)`.
-        model: what is expected of the same, by beliefs that have seen o_t; after `context`, no frame any more.
+        truth: true frames in [0, 1], `(B, T, C, H, W)`.
+        model: expected frames of the same shape, reconstructed up to `context` and imagined after it.
         mask: False after the end of a sequence, which stays white, bool `(B, T)`.
-        context: frames that the model sees.
-        columns: frames shown, those of the context among them; the others evenly to the last.
+        context: number of frames that the model sees.
+        columns: number of frames shown: all of the context, the others evenly spaced to the last.
     """
     rows = torch.stack((truth, model, 0.5 + 0.5 * (model - truth)), 1)  # (B, 3, T, C, H, W)
     white = 0.0 if truth.shape[2] == 1 else 1.0  # grey values are ink
     rows = rows.where(mask[:, None, :, None, None, None], white)
     groups = list(range(1, context + 1)), _later(context, truth.shape[1], columns - context)
-    titles = "seen, and reconstructed", "imagined under the true actions"
+    titles = "observed and reconstructed", "imagined for the true actions"
     names = ("truth", "model", "error"), ()
     bands = [
         [
@@ -44,21 +44,21 @@ def open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, columns:
     return draw_bands(bands)
 
 
-def imagined_futures(truth: Tensor, futures: Tensor, context: int, columns: int) -> Figure:
-    """Draw a sequence and, below it, N futures that are imagined from one belief: the same past before each.
+def draw_futures(truth: Tensor, futures: Tensor, context: int, columns: int) -> Figure:
+    """Draw a sequence and, below it, N futures imagined from one belief, with the same past.
 
     Args:
-        truth: the sequence, values in [0, 1], `(T, C, H, W)`.
-        futures: of the steps context + 1 … T, `(N, T - context, C, H, W)`.
-        context: frames that the model sees.
-        columns: frames shown of each future, evenly to the last.
+        truth: true sequence, values in [0, 1], `(T, C, H, W)`.
+        futures: imagined steps context + 1 … T, `(N, T - context, C, H, W)`.
+        context: number of frames that the model sees.
+        columns: number of frames shown per future, evenly spaced to the last.
     """
-    seen = sorted({-(-context * part // 3) for part in (1, 2, 3)})
+    seen = seen_steps(context)
     later = _later(context, len(truth), columns)
     past = truth[None, [time - 1 for time in seen]]  # (1, S, C, H, W)
     true_rest = truth[None, [time - 1 for time in later]]  # (1, K, C, H, W)
     chosen = futures[:, [time - context - 1 for time in later]]  # (N, K, C, H, W)
-    title = f"truth, and {len(futures)} futures imagined from one belief, under the true actions"
+    title = f"truth, and {len(futures)} futures imagined from one belief for the true actions"
     names = [f"future {number + 1}" for number in range(len(futures))]
     above = [Panel("seen", past, BLACK, (), ["truth"]), Panel(title, true_rest, BLACK)]
     pasts = past.expand(len(futures), -1, -1, -1, -1)  # (N, S, C, H, W)
@@ -67,7 +67,7 @@ def imagined_futures(truth: Tensor, futures: Tensor, context: int, columns: int)
 
 
 def _later(context: int, last: int, count: int) -> list[int]:
-    """Choose steps after the context, counted from 1, evenly from the first to the last."""
+    """Return evenly spaced steps after the context, counted from 1."""
     steps: list[int] = torch.linspace(context + 1, last, count).round().int().unique().tolist()
     return steps
 

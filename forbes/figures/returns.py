@@ -1,4 +1,4 @@
-"""What an agent earns while it learns, against the frames it has seen, beside curves that others have published."""
+"""Plot the returns of agents against env steps, with published curves for comparison."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -21,9 +21,9 @@ def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Seque
     """Draw the return without exploration, and that of the collected episodes, against env steps.
 
     Args:
-        metrics: of the run, as `read_metrics` gives them.
-        task: the title.
-        published: see `published_curves`; mean and range over seeds, as far as the run has come.
+        metrics: metrics of the run, from `read_metrics`.
+        task: name of the task, used as title.
+        published: result of `published_curves`, drawn as mean and range over seeds up to the run's last step.
     """
     table = metrics.reindex(columns=["env_steps", "return/acting", "return/exploring"]).set_index("env_steps")
     acting, exploring = (table[name].dropna() for name in table)
@@ -40,14 +40,14 @@ def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Seque
 
 
 def returns_against_env_steps(task: str, agents: Mapping[str, Sequence[pd.Series]]) -> Figure:
-    """Draw what agents earn without exploration: mean and range over seeds, at the steps that all seeds have reached.
+    """Draw the returns of agents without exploration: mean and range over seeds, at the steps that all seeds reached.
 
     Args:
-        task: the title.
-        agents: by name, a curve for each seed, returns against env steps.
+        task: name of the task, used as title.
+        agents: curves of returns against env steps by agent, one per seed.
 
     Raises:
-        ForbesError: where the curves of an agent have no step in common.
+        ForbesError: if the curves of an agent have no step in common.
     """
     with paper_style():
         figure = Figure((COLUMN, 2.6), layout="constrained")
@@ -62,12 +62,12 @@ def returns_against_env_steps(task: str, agents: Mapping[str, Sequence[pd.Series
 
 
 def _joined(curves: Sequence[pd.Series]) -> pd.DataFrame:
-    """Let seeds that were measured at different steps meet at all of them."""
+    """Interpolate the curves of all seeds to common steps."""
     return pd.concat(curves, axis=1).sort_index().interpolate("index", limit_area="inside").dropna()
 
 
 def _label(axes: Axes, task: str, end: float) -> None:
-    axes.set(xlabel="env steps (frames)", ylabel="return of an episode", title=task)
+    axes.set(xlabel="env steps (frames)", ylabel="return per episode", title=task)
     axes.set_xlim(0, 1.02 * end)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
     axes.locator_params("x", nbins=6)
@@ -75,25 +75,25 @@ def _label(axes: Axes, task: str, end: float) -> None:
 
 
 def published_curves(path: str | None, task: str) -> dict[str, list[pd.Series]]:
-    """Read the curves of a task: by method, one for each seed, returns against env steps.
+    """Read the published curves of a task: returns against env steps by method, one per seed.
 
     Args:
-        path: a JSON list of `{"task": …, "method": …, "seed": …, "xs": [env steps], "ys": [returns]}`, as the Dreamer
-            authors publish it; their names of tasks begin with `dmc_`. None for those of `forbes data fetch curves`:
-            no curves where they were not fetched, or lack the task.
-        task: ours, `cartpole_swingup`.
+        path: file with a JSON list of `{"task": …, "method": …, "seed": …, "xs": [env steps], "ys": [returns]}`, as
+            published by the authors of Dreamer; their task names may begin with `dmc_`. None for the file of
+            `forbes data fetch curves`, which gives no curves if it is missing or lacks the task.
+        task: name of the task, e.g. `cartpole_swingup`.
 
     Raises:
-        ForbesError: where the file cannot be read so, or one that was named does not have the task.
+        ForbesError: if the file is invalid, or a file given by `path` lacks the task.
     """
     if path is None and not curves_path().is_file():
         return {}
-    names = {task, f"dmc_{task}", f"dmc_{task.removeprefix('ball_in_')}"}  # Dreamer's name of it is cup_catch
+    names = {task, f"dmc_{task}", f"dmc_{task.removeprefix('ball_in_')}"}  # Dreamer calls ball_in_cup_catch cup_catch
     curves: dict[str, list[pd.Series]] = {}
     known = set()
     file, remedy = Path(path or curves_path()), "Name another, or none"
     if not file.is_file():
-        raise ForbesError(f"{file}: no such file of curves that can be read. {remedy}")
+        raise ForbesError(f"{file}: no such file. {remedy}")
     found = read_json(file, remedy)
     with readable(file, "a file of curves, expected a JSON list of task, method, seed, xs and ys", remedy):
         for one in found:
@@ -103,5 +103,5 @@ def published_curves(path: str | None, task: str) -> dict[str, list[pd.Series]]:
                 curves.setdefault(one["method"], []).append(curve)
     if path and not curves:
         listed = ", ".join(sorted(known)) or "nothing"
-        raise ForbesError(f"{path}: has no curve of {task}, but of {listed}. Name another file, or none")
+        raise ForbesError(f"{path}: has no curve for {task}, only for {listed}. Name another file, or none")
     return curves

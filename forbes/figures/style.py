@@ -1,4 +1,4 @@
-"""The look of every picture, set in one place: sizes for a paper of two columns, few colours, no pyplot state."""
+"""The common style of all figures: sizes for a two-column paper, few colours, no pyplot state."""
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,16 +16,16 @@ from forbes.errors import ForbesError
 from forbes.files import replace_file
 
 __all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "density_map", "draw_range"]
-__all__ += ["draw_references", "paper_style", "save_figure", "show_settled"]
+__all__ += ["draw_references", "paper_style", "save_figure", "save_png_and_pdf", "show_settled"]
 
 COLUMN, PAGE = 3.3, 6.9
 """Widths in inches: one column and the whole page."""
 
 BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#007a5a"
-"""They differ in hue and in brightness, for the colour-blind and for print (after Okabe and Ito)."""
+"""Colours that differ in hue and brightness, for colour-blind readers and print (after Okabe and Ito)."""
 BLACK, GREY = "#1a1a1a", "#808080"
 PALETTE = (BLUE, ORANGE, GREEN, BLACK, "#cc79a7", "#56b4e9", "#e69f00", GREY)
-"""For models side by side, in their order."""
+"""Colours of several models, in order."""
 
 _STYLE: dict[Any, Any] = {
     "axes.grid": True,
@@ -35,7 +35,7 @@ _STYLE: dict[Any, Any] = {
     "axes.titlesize": 8,
     "figure.dpi": 200,
     "figure.titlesize": 8,
-    "font.family": "DejaVu Sans",  # comes with matplotlib: the same picture on every machine
+    "font.family": "DejaVu Sans",  # bundled with matplotlib, so that figures are the same on every machine
     "font.size": 8,
     "grid.alpha": 0.3,
     "grid.linewidth": 0.5,
@@ -43,7 +43,7 @@ _STYLE: dict[Any, Any] = {
     "legend.fontsize": 7,
     "legend.frameon": False,
     "lines.linewidth": 1.2,
-    "pdf.fonttype": 42,  # fonts as TrueType: text stays text
+    "pdf.fonttype": 42,  # TrueType, so that text can be selected
     "savefig.dpi": 200,
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
@@ -52,26 +52,34 @@ _STYLE: dict[Any, Any] = {
 
 @contextmanager
 def paper_style() -> Iterator[None]:
-    """Draw in our style, and leave the caller's as it was."""
+    """Use our style inside the `with` block."""
     with mpl.rc_context(_STYLE):
         yield
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a picture in the format of the path's suffix; a reader never sees half of it, old or new.
+    """Write a figure atomically, in the format of the path's suffix.
 
     Raises:
-        ForbesError: for a suffix that is no format of pictures.
+        ForbesError: if the suffix is not an image format.
     """
     content = io.BytesIO()
-    # Without a date, the same picture is the same bytes.
+    # Without a date, the same figure has the same bytes.
     metadata = {"CreationDate": None} if path.suffix == ".pdf" else None
     try:
         with paper_style():
             figure.savefig(content, format=path.suffix[1:] or "png", metadata=metadata)
     except ValueError as error:
-        raise ForbesError(f"{path}: is no picture's name ({error}). End it in .png") from error
+        raise ForbesError(f"{path}: is not the name of an image ({error}). End it in .png") from error
     replace_file(path, content.getvalue())
+
+
+def save_png_and_pdf(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure as `NAME.png` and `NAME.pdf` to a folder, and return both paths."""
+    paths = [folder / f"{name}{suffix}" for suffix in (".png", ".pdf")]
+    for path in paths:
+        save_figure(figure, path)
+    return paths
 
 
 def density_map(colour: str) -> LinearSegmentedColormap:
@@ -80,17 +88,17 @@ def density_map(colour: str) -> LinearSegmentedColormap:
 
 
 def draw_range(axes: Axes, runs: pd.DataFrame, colour: str, label: str) -> None:
-    """Draw mean and range of several runs, a column each, against the index."""
+    """Draw mean and range of several runs, one column each, against the index."""
     axes.fill_between(runs.index, runs.min(axis=1), runs.max(axis=1), color=colour, alpha=0.2, lw=0)
-    marker = "o" if len(runs) == 1 else ""  # a line of one point would not be seen
+    marker = "o" if len(runs) == 1 else ""  # a line of one point would be invisible
     axes.plot(runs.index, runs.mean(axis=1), color=colour, label=label, marker=marker, markersize=3)
 
 
 def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", "y"] = "y") -> bool:
-    """Draw a dotted line at each mean on an axis that shows scores, and return whether there is one.
+    """Draw a dotted line at each mean on a score axis, and return whether there is one.
 
-    Those far outside of what is shown, by more than its extent, are left out. Of the others the axis shows all, and the
-    name of the highest.
+    Means that are outside the axis by more than its extent are omitted. The axis is extended to the others, and the
+    highest one is labelled.
     """
     low, high = axes.get_ylim() if along == "y" else axes.get_xlim()
     near = {name: mean for name, mean in means.items() if 2 * low - high < mean < 2 * high - low}
@@ -113,7 +121,7 @@ def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", 
 
 
 def show_settled(axes: Axes, curves: Sequence[pd.Series]) -> None:
-    """Choose the height of an axis of curves over updates: their first quarter, which comes from afar, may leave it."""
+    """Set the y limits of an axis of curves to the range after their first quarter, in which they change fast."""
     first = 0.25 * max(curve.index.max() for curve in curves)
     settled = [value for curve in curves for value in curve[curve.index >= first]]
     margin = 0.05 * (max(settled) - min(settled)) + 1e-6

@@ -1,7 +1,7 @@
-"""Partially observable processes whose belief is known exactly, one file each, all through `Process`."""
+"""Partially observable processes with an exactly known belief, one file each, with the interface `Process`."""
 
 from forbes.pomdps.base import AffineGaussian, ExactFilter, Process, Trajectories
-from forbes.pomdps.beliefs import CategoricalBelief, ExactBelief, GaussianMixtureBelief, GridBelief
+from forbes.pomdps.beliefs import ExactBelief, FiniteBelief, GaussianMixtureBelief, GridBelief
 from forbes.pomdps.light_dark import LightDark
 from forbes.pomdps.linear_gaussian import LinearGaussian
 from forbes.pomdps.mirror_sensor import MirrorSensor
@@ -12,9 +12,9 @@ from forbes.pomdps.ungm import Ungm
 
 __all__ = [
     "AffineGaussian",
-    "CategoricalBelief",
     "ExactBelief",
     "ExactFilter",
+    "FiniteBelief",
     "GaussianMixtureBelief",
     "GridBelief",
     "LightDark",

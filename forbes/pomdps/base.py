@@ -1,4 +1,4 @@
-r"""The interface of every process: it samples itself, gives its own densities, and its belief is known exactly.
+r"""The interface of all processes: sampling, densities, and the exact belief.
 
 .. math:: s_1 \sim p(s), \qquad s_t \sim p(s \mid s_{t-1}, a_{t-1}), \qquad o_t \sim p(o \mid s_t)
 """
@@ -20,7 +20,7 @@ __all__ = ["AffineGaussian", "ExactFilter", "Process", "Trajectories", "require_
 
 @printed_by_shape
 class Trajectories(NamedTuple):
-    """Sequences of a process in float64. Index t holds (s_t, o_t, a_{t-1}): the action that led there, 0 at the start.
+    """Sequences of a process in float64. Index t has (s_t, o_t, a_{t-1}): the action that led to s_t, 0 at the start.
 
     An example of three steps, where a1 leads from s1 to s2::
 
@@ -39,25 +39,25 @@ class Trajectories(NamedTuple):
 
 @printed_by_shape
 class ExactFilter(NamedTuple):
-    """What one exact pass over the observations gives."""
+    """Result of exact filtering."""
 
     belief: ExactBelief
-    """p(s_t | o_1:t, a_1:t-1), one for each sequence and step, `(B, T)`."""
+    """p(s_t | o_1:t, a_1:t-1) for each sequence and step, `(B, T)`."""
     step_log_likelihood: Tensor
-    """log p(o_t | o_1:t-1, a_1:t-1) in nats, `(B, T)`: the most that a prequential score can reach in expectation."""
+    """log p(o_t | o_1:t-1, a_1:t-1) in nats, `(B, T)`: the highest prequential score in expectation."""
 
     @property
     def log_likelihood(self) -> Tensor:
-        """Sum them to log p(o_1:T | a_1:T-1) in nats, `(B,)`."""
+        """Total log-likelihood log p(o_1:T | a_1:T-1) in nats, `(B,)`."""
         return self.step_log_likelihood.sum(1)
 
 
 @printed_by_shape
 class AffineGaussian(NamedTuple):
-    r"""A Gaussian whose mean is affine in the state before: :math:`p(s_t \mid s_{t-1}) = N(G_t s_{t-1} + g_t, C_t)`."""
+    r"""A Gaussian with a mean affine in the previous state: :math:`p(s_t \mid s_{t-1}) = N(G_t s_{t-1} + g_t, C_t)`."""
 
     gain: Tensor
-    """G_t, `(T, D, D)`; zero at the start, where no state comes before."""
+    """G_t, `(T, D, D)`; zero at the start, where there is no previous state."""
     offset: Tensor
     """g_t, `(B, T, D)`."""
     covariance: Tensor
@@ -70,23 +70,23 @@ class AffineGaussian(NamedTuple):
 
 
 class Process(Named, ABC):
-    """A partially observable process whose belief is known exactly.
+    """A partially observable process with an exactly known belief.
 
-    To add one, copy the file that is most like it: `linear_gaussian.py` (Kalman), `mirror_sensor.py` (grid) or
-    `tiger.py` (finite). It has three dimensions and says how it starts, moves, is seen and is acted on; sampling and
-    densities follow from these. Finite states, observations and actions are one-hot vectors.
+    To add one, copy the file that is most similar: `linear_gaussian.py` (Kalman), `mirror_sensor.py` (grid) or
+    `tiger.py` (finite). A process defines three dimensions, its initial distribution, transition, emission and policy.
+    Sampling and densities follow from these. Finite states, observations and actions are one-hot vectors.
 
-    An action never depends on the state, so nothing is learned about the state from it.
+    Actions never depend on the state, so they carry no information about it.
     """
 
     state_dim: int
-    """D."""
+    """Dimension of the state, D."""
     observation_dim: int
-    """O."""
+    """Dimension of an observation, O."""
     action_dim: int
-    """A, 0 for a process without actions."""
+    """Dimension of an action, A; 0 for a process without actions."""
     action_scale: float = 1.0
-    """What an agent's action in [-1, 1]^A is multiplied by."""
+    """Factor that is applied to an agent's action in [-1, 1]^A."""
 
     @abstractmethod
     def initial(self, like: Tensor) -> Distribution:
@@ -102,7 +102,7 @@ class Process(Named, ABC):
 
     @abstractmethod
     def policy(self, sequences: int, steps: int, generator: torch.Generator) -> Tensor:
-        """Draw a_1, a_2, … of `sample`, blind to everything else: float64 `(B, steps, A)`."""
+        """Sample actions a_1, a_2, … for `sample`, independent of states and observations: float64 `(B, steps, A)`."""
 
     @abstractmethod
     def exact_filter(self, observation: Tensor, action: Tensor) -> ExactFilter:
@@ -113,27 +113,27 @@ class Process(Named, ABC):
             action: a_{t-1}, zero at the first step, `(B, T, A)`.
 
         Raises:
-            ForbesError: where a shape or a value is not what the process can produce (`checked`).
+            ForbesError: if a shape or a value is not one that the process can produce (`checked`).
         """
 
     def exact_smoothing_conditional(self, observation: Tensor, action: Tensor) -> AffineGaussian | None:
-        r"""Compute :math:`p(s_t \mid s_{t-1}, a, o_{t:T})`, in float64 on the CPU, where it is Gaussian, else None.
+        r"""Return :math:`p(s_t \mid s_{t-1}, a, o_{t:T})`, in float64 on the CPU, or None if it is not Gaussian.
 
-        The product over t is the posterior of the whole path: the optimal proposal, whose weights are all p(o).
+        The product over t is the posterior of the whole path, the optimal proposal, all of whose weights are p(o).
         """
         return None
 
     def reward(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        """Return r(s_{t-1}, a_{t-1}, s_t) for `(*, D)`, `(*, A)` and `(*, D)`, `(*)`; it is never seen by the filter.
+        """Return r(s_{t-1}, a_{t-1}, s_t) for `(*, D)`, `(*, A)` and `(*, D)`, `(*)`. The filter does not use it.
 
         Raises:
-            ForbesError: where the process has no rewards.
+            ForbesError: if the process has no rewards.
         """
         where = type(self).__name__
-        raise ForbesError(f"{where}: has no rewards, expected a process that gives them. Choose another, or add them")
+        raise ForbesError(f"{where}: has no rewards, expected a process with rewards. Choose another, or add them")
 
     def terminal(self, state: Tensor) -> Tensor:
-        """Tell the states after which an agent's episode ends: `(*, D)` to bool `(*)`. `sample` goes on in them."""
+        """Return whether an agent's episode ends in a state: `(*, D)` to bool `(*)`. `sample` ignores this."""
         return torch.zeros(state.shape[:-1], dtype=torch.bool, device=state.device)
 
     def log_likelihood(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -153,37 +153,37 @@ class Process(Named, ABC):
         return self.emission(state).log_prob(observation)
 
     def sample(self, sequences: int, length: int, generator: torch.Generator) -> Trajectories:
-        """Draw B sequences of T steps under `policy`: a pure function of the generator's state.
+        """Sample B sequences of T steps under `policy`, as a pure function of the generator's state.
 
         Raises:
-            ForbesError: when there is not at least one sequence of one step.
+            ForbesError: if `sequences` or `length` is below 1.
         """
         require_positive(type(self).__name__, sequences=sequences, length=length)
         start = torch.zeros(sequences, 1, self.action_dim, dtype=torch.float64)
-        policy = self.policy(sequences, length, generator)  # a_1, ..., a_T, whose last leads nowhere, (B, T, A)
+        policy = self.policy(sequences, length, generator)  # a_1, ..., a_T, of which a_T is not used, (B, T, A)
         action = torch.cat((start, policy[:, :-1]), 1)  # (B, T, A)
         state = self.initial(start).sample(sequences, generator)  # (B, D)
         states = [state]
-        for led_here in action.unbind(1)[1:]:
-            state = self.transition(state, led_here).sample(1, generator).squeeze(0)  # (B, D)
+        for previous_action in action.unbind(1)[1:]:
+            state = self.transition(state, previous_action).sample(1, generator).squeeze(0)  # (B, D)
             states.append(state)
         path = torch.stack(states, 1)  # (B, T, D)
         return Trajectories(path, self.emission(path).sample(1, generator).squeeze(0), action)
 
     def checked(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both in float64 on the CPU, or say in one sentence what is wrong with them."""
+        """Return both in float64 on the CPU; raise a ForbesError if a shape or value is invalid."""
         where = type(self).__name__
         _require_sequences(f"{where}: the observation", observation, self.observation_dim)
         _require_sequences(f"{where}: the action", action, self.action_dim)
         if observation.shape[:2] != action.shape[:2]:
             shapes = f"{tuple(observation.shape[:2])} and {tuple(action.shape[:2])}"
             raise ForbesError(
-                f"{where}: (B, T) of observation and action are {shapes}, expected the same. Cut both alike"
+                f"{where}: (B, T) of observation and action are {shapes}, expected the same. Cut both to one length"
             )
         if action[:, 0].any():
             raise ForbesError(
-                f"{where}: the first action is not zero, expected at index t the action that led to the observation. "
-                "Shift the actions by one step"
+                f"{where}: the first action is not zero, expected index t to have the action that led to o_t. Shift "
+                "the actions by one step"
             )
         return observation.double().cpu(), action.double().cpu()
 

@@ -1,4 +1,4 @@
-"""Exact beliefs: Gaussian mixtures, densities on a grid, and finite distributions, behind one interface."""
+"""Exact beliefs with one interface: Gaussian mixtures, densities on a grid, and finite distributions."""
 
 import math
 from abc import abstractmethod
@@ -9,11 +9,11 @@ from torch.nn.functional import one_hot
 
 from forbes.pomdps.distributions import Distribution, draw_index, draw_normal
 
-__all__ = ["CategoricalBelief", "ExactBelief", "GaussianMixtureBelief", "GridBelief"]
+__all__ = ["ExactBelief", "FiniteBelief", "GaussianMixtureBelief", "GridBelief"]
 
 
 class ExactBelief(Distribution):
-    r"""A distribution of :math:`s_t` given :math:`o_{1:t}`, one for every sequence and step: `(*)` is `(B, T)`."""
+    r"""A distribution of :math:`s_t` given :math:`o_{1:t}` for every sequence and step, so `(*)` is `(B, T)`."""
 
     @property
     @abstractmethod
@@ -28,15 +28,15 @@ class ExactBelief(Distribution):
     @property
     @abstractmethod
     def entropy(self) -> Tensor | None:
-        r""":math:`-E \log p(s)` in nats, `(*)`, where it has a closed form or is a finite sum, else None."""
+        r""":math:`-E \log p(s)` in nats, `(*)`; None if it has no closed form and is not a finite sum."""
 
 
 class GaussianMixtureBelief(ExactBelief):
-    r"""K Gaussians of one covariance.
+    r"""A mixture of K Gaussians with a common covariance.
 
     .. math:: p(s) = \sum_k w_k\, N(s; \mu_k, \Sigma)
 
-    A Kalman filter's covariance does not depend on what was observed, so filters that start apart share it.
+    The covariance of a Kalman filter does not depend on the observations, so filters with different starts share it.
 
     Args:
         log_weight: :math:`\log w_k`, normalised, `(*, K)`.
@@ -93,7 +93,7 @@ class GaussianMixtureBelief(ExactBelief):
 
 
 class GridBelief(ExactBelief):
-    r"""A scalar with constant density in each of G cells of equal width: integrals over it are finite sums.
+    r"""A scalar distribution with constant density in G cells of equal width: integrals are finite sums.
 
     .. math:: p(s) = m_i / \Delta \quad\text{where}\quad |s - c_i| < \Delta / 2, \qquad c_i = c_0 + i \Delta
 
@@ -122,10 +122,10 @@ class GridBelief(ExactBelief):
         return found.where((cell >= 0) & (cell < cells), -torch.inf) - math.log(self.width)
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """See `Distribution.sample`: a cell, and a place in it."""
+        """See `Distribution.sample`: a cell, and a position in the cell."""
         cell = draw_index(self.log_mass, count, generator)  # (count, *)
-        place = torch.rand(cell.shape, generator=generator, dtype=self.log_mass.dtype) - 0.5
-        return (self.first + self.width * (cell + place)).unsqueeze(-1)  # (count, *, 1)
+        offset = torch.rand(cell.shape, generator=generator, dtype=self.log_mass.dtype) - 0.5
+        return (self.first + self.width * (cell + offset)).unsqueeze(-1)  # (count, *, 1)
 
     @property
     def mean(self) -> Tensor:
@@ -149,7 +149,7 @@ class GridBelief(ExactBelief):
         return torch.arange(self.log_mass.shape[-1], dtype=self.log_mass.dtype, device=self.log_mass.device)  # (G,)
 
 
-class CategoricalBelief(ExactBelief):
+class FiniteBelief(ExactBelief):
     """A finite distribution over one-hot vectors.
 
     Args:
@@ -160,7 +160,7 @@ class CategoricalBelief(ExactBelief):
         self.log_mass = log_mass
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """See `Distribution.log_prob`, of a one-hot vector; a log-probability."""
+        """See `Distribution.log_prob`: log-probability of a one-hot vector."""
         return torch.where(value.bool(), self.log_mass, 0.0).sum(-1)  # not a product: 0 times -inf
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
@@ -185,5 +185,5 @@ class CategoricalBelief(ExactBelief):
 
 
 def _entropy(log_mass: Tensor) -> Tensor:
-    each: Tensor = torch.special.entr(log_mass.exp())  # 0 log 0 is 0
-    return each.sum(-1)
+    entropies: Tensor = torch.special.entr(log_mass.exp())  # 0 log 0 = 0
+    return entropies.sum(-1)

@@ -1,7 +1,7 @@
 r"""Bayes filter of a scalar state on a grid: every integral is a sum over cells of equal width.
 
-The sum is the midpoint rule. For smooth densities that vanish at both ends its error falls faster than any power of
-the width; where a density has a kink, with the width's square, unless the grid is laid out for it (`Grid.around_kink`).
+The sum is the midpoint rule. For smooth densities that vanish at both ends its error falls faster than any power of the
+width. If a density has a kink, it falls with the square of the width, unless the grid is aligned (`Grid.around_kink`).
 """
 
 import math
@@ -18,23 +18,26 @@ from forbes.pomdps.beliefs import GridBelief
 __all__ = ["Grid", "grid_filter", "require_inside"]
 
 EDGE_MASS = 1e-6
-"""The most that the outermost cells may hold: more, and the state may have left the grid."""
+"""Maximal probability of an outermost cell. With more, the state may have left the grid."""
 
 
 class Grid(NamedTuple):
-    """Cells of equal width, given by the centres of the first and of the last."""
+    """Cells of equal width."""
 
     first: float
+    """Centre of the first cell."""
     last: float
+    """Centre of the last cell."""
     cells: int
+    """Number of cells, G."""
 
     @classmethod
     def around_kink(cls, first: float, last: float, cells: int, kink: float) -> "Grid":
-        r"""Shift a grid by less than a cell, to where a kink of the integrand costs least.
+        r"""Shift a grid by less than a cell, such that a kink of the integrand causes the smallest error.
 
-        A slope that jumps by J at :math:`\theta\Delta` behind a centre leaves the sum with an error of
-        :math:`-\tfrac12 J \Delta^2 B_2(\theta)`, by Euler and Maclaurin, :math:`B_2(\theta) = \theta^2 - \theta +
-        \tfrac16`. It vanishes at :math:`\theta = (3 - \sqrt3) / 6`.
+        If the slope jumps by J at a distance :math:`\theta\Delta` after a centre, the sum has the error
+        :math:`-\tfrac12 J \Delta^2 B_2(\theta)` with :math:`B_2(\theta) = \theta^2 - \theta + \tfrac16`, by Euler and
+        Maclaurin. It vanishes at :math:`\theta = (3 - \sqrt3) / 6`.
         """
         width = (last - first) / (cells - 1)
         shift = (kink - first) % width - (3 - math.sqrt(3)) / 6 * width
@@ -52,7 +55,7 @@ class Grid(NamedTuple):
 
 
 def grid_filter(process: Process, grid: Grid, observation: Tensor, action: Tensor) -> ExactFilter:
-    r"""Filter a process of one state dimension by its own densities.
+    r"""Filter a process with a one-dimensional state by its densities.
 
     .. math::
 
@@ -60,24 +63,24 @@ def grid_filter(process: Process, grid: Grid, observation: Tensor, action: Tenso
         p(o_t \mid o_{<t}) = \Delta \sum_i p(o_t \mid c_i)\, \pi_t(c_i), \qquad
         m_{i,t} = \frac{\Delta\, p(o_t \mid c_i)\, \pi_t(c_i)}{p(o_t \mid o_{<t})}
 
-    A step costs B G² for the sum and G² for each distinct action of the batch.
+    A step costs B G² for the sum, and G² for each distinct action in the batch.
 
     Args:
-        process: gives the densities.
-        grid: G cells.
-        observation: `(B, T, O)`.
-        action: `(B, T, A)`.
+        process: process with transition and emission densities.
+        grid: grid of G cells.
+        observation: o_t, `(B, T, O)`.
+        action: a_{t-1}, `(B, T, A)`.
 
     Raises:
-        ForbesError: where the belief reaches the end of the grid.
+        ForbesError: if the belief reaches the end of the grid.
     """
     centres = grid.centres.unsqueeze(-1)  # (G, 1)
 
     @lru_cache(maxsize=1)  # a process without actions has one
     def density(*values: float) -> Tensor:
-        """p(c_i | c_j, a), `(G, G)` with the row j."""
-        one = torch.tensor(values, dtype=torch.float64)  # (A,)
-        return process.log_transition(centres, centres.unsqueeze(1), one).exp()  # (G, G)
+        """Return p(c_i | c_j, a), `(G, G)` with row j and column i."""
+        one_action = torch.tensor(values, dtype=torch.float64)  # (A,)
+        return process.log_transition(centres, centres.unsqueeze(1), one_action).exp()  # (G, G)
 
     seen = process.log_observation(observation.unsqueeze(2), centres)  # (B, T, G)
     log_predicted = process.log_initial(centres).expand(len(observation), -1)  # (B, G)
@@ -99,11 +102,11 @@ def grid_filter(process: Process, grid: Grid, observation: Tensor, action: Tenso
 
 
 def require_inside(where: str, belief: GridBelief) -> None:
-    """Raise a ForbesError where the outermost cells hold so much that mass beyond them may be missing."""
+    """Raise a ForbesError if the mass in an outermost cell is so large that mass outside may be missing."""
     edge = torch.maximum(belief.log_mass[..., 0], belief.log_mass[..., -1])  # (B, T)
-    if len(outside := torch.nonzero(~(edge <= math.log(EDGE_MASS)))):  # also where it is not a number
+    if len(outside := torch.nonzero(~(edge <= math.log(EDGE_MASS)))):  # also if it is NaN
         sequence, step = outside[0].tolist()
         raise ForbesError(
             f"{where}: the belief of sequence {sequence} at step {step} reaches the end of the grid, expected at most "
-            f"{EDGE_MASS:g} in its outermost cells. Leave the sequence out, the process hardly ever gives such a one"
+            f"{EDGE_MASS:g} in its outermost cells. Exclude the sequence, which is very unlikely under the process"
         )

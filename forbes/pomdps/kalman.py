@@ -2,7 +2,7 @@ r"""Kalman filter and backward information filter of a linear-Gaussian system (K
 
 .. math:: s_1 \sim \tfrac1K \sum_k N(m_k, P_1), \qquad s_t = F s_{t-1} + u_t + N(0, Q), \qquad o_t = H s_t + N(0, R)
 
-Covariances and gains depend on no observation: they are computed once for all sequences and all K starts.
+Covariances and gains do not depend on the observations, so they are computed once for all sequences and K starts.
 """
 
 import math
@@ -30,13 +30,13 @@ class LinearSystem(NamedTuple):
     emission_covariance: Tensor
     """R, `(O, O)`."""
     initial_mean: Tensor
-    """m_k, one for each of K equally likely starts, `(K, D)`."""
+    """m_k of K equally likely starts, `(K, D)`."""
     initial_covariance: Tensor
     """P_1, `(D, D)`."""
 
 
 def kalman_filter(system: LinearSystem, observation: Tensor, drive: Tensor) -> ExactFilter:
-    r"""Filter from each start, and weigh the starts by their evidence.
+    r"""Filter from each start, and weight the starts by their evidence.
 
     .. math::
 
@@ -46,12 +46,12 @@ def kalman_filter(system: LinearSystem, observation: Tensor, drive: Tensor) -> E
         w_{k,t} \propto w_{k,t-1}\, N(o_t; H\mu_k^-, S)
 
     Args:
-        system: the matrices.
-        observation: o_t, `(B, T, O)`.
-        drive: u_t, what the action adds to the state, `(B, T, D)`; the first is not used.
+        system: matrices of the system.
+        observation: observations o_t, `(B, T, O)`.
+        drive: effect of the action on the state, u_t, `(B, T, D)`; the first is not used.
 
     Returns:
-        The mixture of K Gaussians at each step, and each step's evidence.
+        Mixture of K Gaussians and evidence at each step.
     """
     transition, noise, emission, emission_noise, start, covariance = system
     mean = start.expand(len(observation), -1, -1)  # (B, K, D)
@@ -77,7 +77,7 @@ def kalman_filter(system: LinearSystem, observation: Tensor, drive: Tensor) -> E
 
 
 def smoothing_conditional(system: LinearSystem, observation: Tensor, drive: Tensor) -> AffineGaussian:
-    r"""Compute :math:`p(s_t \mid s_{t-1}, o_{t:T})` for K = 1, backwards in time, with what is still to be seen.
+    r"""Return :math:`p(s_t \mid s_{t-1}, o_{t:T})` for K = 1, by a backward recursion over future observations.
 
     .. math::
 
@@ -88,7 +88,8 @@ def smoothing_conditional(system: LinearSystem, observation: Tensor, drive: Tens
         p(s_t \mid s_{t-1}, o_{t:T}) = N\!\left(N_t (F s_{t-1} + u_t + Q \eta_t),\, N_t Q\right), \quad
         N_t = (I + Q \Lambda_t)^{-1}
 
-    At t = 1 the start's mean stands for :math:`F s_{t-1} + u_t` and :math:`P_1` for Q. Arguments as in `kalman_filter`.
+    At t = 1, :math:`F s_{t-1} + u_t` is replaced by the initial mean, and Q by :math:`P_1`. The arguments are those of
+    `kalman_filter`.
     """
     transition, noise, emission, emission_noise, start, start_covariance = system
     unit = torch.eye(len(noise), dtype=noise.dtype)
@@ -104,12 +105,12 @@ def smoothing_conditional(system: LinearSystem, observation: Tensor, drive: Tens
         ahead = ahead + reading @ emission
         spread = noise if time > 0 else start_covariance
         shrink = torch.linalg.inv(unit + spread @ ahead)  # N_t, (D, D)
-        known = drive[:, time] if time > 0 else start  # what does not depend on s_{t-1}, (B or 1, D)
+        known = drive[:, time] if time > 0 else start  # the part independent of s_{t-1}, (B or 1, D)
         gain = shrink @ transition if time > 0 else torch.zeros_like(shrink)
         covariance = shrink @ spread
         steps.append((gain, (known + information @ spread) @ shrink.T, (covariance + covariance.T) / 2))
     gains, offsets, covariances = zip(*reversed(steps), strict=True)
-    return AffineGaussian(torch.stack(gains), torch.stack(offsets, 1), torch.stack(covariances))  # (B, T, D) the second
+    return AffineGaussian(torch.stack(gains), torch.stack(offsets, 1), torch.stack(covariances))
 
 
 def _log_normal(deviation: Tensor, covariance: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The light-dark problem in one dimension: the nearer to the light, the better it is known where one is."""
+"""The light-dark problem in one dimension: observations are more precise near the light."""
 
 import math
 
@@ -14,15 +14,15 @@ __all__ = ["LightDark"]
 
 
 class LightDark(Process):
-    r"""A walker who knows each step, and whose only uncertainty is where the walk began.
+    r"""A walker with known steps and an unknown start.
 
     .. math:: s_1 \sim N(2, 3^2), \qquad s_t = s_{t-1} + a_{t-1}, \qquad o_t \sim N(s_t, \sigma(s_t)^2), \quad
               \sigma(s) = |s - 5| / \sqrt2 + 0.01
 
-    `LightDark1D` of POMDPModels.jl, without the action that ends an episode. An observation far from the light at 5
-    rules out that the walker stands near it: the belief has a notch there, and two modes about it.
+    This is `LightDark1D` of POMDPModels.jl without the action that ends an episode. An observation far from the light
+    at 5 rules out that the walker is near it, so the belief has a notch there and two modes around it.
 
-    As the steps are certain, the belief is over the start, and moves with the walker:
+    As the steps are known, the belief is over the start, and moves with the walker:
 
     .. math:: p(s_t = x \mid o_{1:t}) \propto p(s_1 = y) \prod_{i \le t} p(o_i \mid y + a_1 + \dots + a_{i-1}),
               \qquad y = x - a_1 - \dots - a_{t-1}
@@ -30,9 +30,9 @@ class LightDark(Process):
     Actions of `sample` are steps of 1 to the left or to the right, equally likely and independent over time.
 
     Args:
-        cells_per_step: of the grid of starts on [-25, 29], nine standard deviations to each side. With 250, log
-            p(o_1:30) has an error of 4e-5 nats in the mean of sequences: none for most, and up to 6e-3 for a walk that
-            is seen to pass the light.
+        cells_per_step: number of cells per step of the grid of starts on [-25, 29], nine standard deviations to each
+            side. With 250, log p(o_1:30) has a mean error of 4e-5 nats: none for most sequences, and up to 6e-3 for a
+            walk observed to pass the light.
 
     Example:
         >>> process = forbes.LightDark(cells_per_step=20)
@@ -47,7 +47,7 @@ class LightDark(Process):
 
     def __init__(self, cells_per_step: int = 250) -> None:
         require_positive("LightDark", cells_per_step=cells_per_step)
-        # Steps are whole numbers, so σ(s) has its kink at the same place of a cell wherever the walker is.
+        # Steps are integers, so the kink of σ(s) is always at the same position within a cell.
         self.grid = Grid.around_kink(-25.0, 29.0, 54 * cells_per_step + 1, kink=5.0)
 
     def initial(self, like: Tensor) -> DiagonalGaussian:
@@ -55,7 +55,7 @@ class LightDark(Process):
         return DiagonalGaussian(like.new_full((1,), 2.0), 3.0)
 
     def transition(self, state: Tensor, action: Tensor) -> PointMass:
-        """See `Process.transition`: certain, so without a density."""
+        """See `Process.transition`: deterministic, so without a density."""
         return PointMass(state + action)
 
     def emission(self, state: Tensor) -> DiagonalGaussian:

@@ -1,4 +1,4 @@
-"""A scalar linear-Gaussian process: everything about it has a closed form."""
+"""A scalar linear-Gaussian process, for which everything has a closed form."""
 
 import math
 
@@ -13,19 +13,19 @@ __all__ = ["LinearGaussian"]
 
 
 class LinearGaussian(Process):
-    r"""A random walk seen through noise.
+    r"""A random walk with noisy observations.
 
     .. math:: s_1 \sim N(0, P_1), \qquad s_t = F s_{t-1} + N(0, Q), \qquad o_t = s_t + N(0, R)
 
     The defaults, all 1, are those of FIVO's Gaussian HMM (Maddison et al., 2017, arXiv 1705.09279; `ghmm.py` of its
-    code). `LinearGaussian(transition_variance=0.1)` is harder: what one observation says is little against the belief,
-    and an ELBO-trained belief far too narrow. `LinearGaussian(0.9, 0.3, 0.5)` is stationary in the long run.
+    code). `LinearGaussian(transition_variance=0.1)` is harder: an observation has little information compared to the
+    belief, and an ELBO-trained belief is far too narrow. `LinearGaussian(0.9, 0.3, 0.5)` is stationary in the long run.
 
     Args:
-        transition: F.
-        transition_variance: Q.
-        observation_variance: R.
-        initial_variance: :math:`P_1`.
+        transition: coefficient F.
+        transition_variance: variance of the transition, Q.
+        observation_variance: variance of the observations, R.
+        initial_variance: variance of the first state, :math:`P_1`.
 
     Example:
         >>> process = forbes.LinearGaussian(observation_variance=0.5)
@@ -83,7 +83,7 @@ class LinearGaussian(Process):
         return smoothing_conditional(self.system(), observation, torch.zeros_like(observation))
 
     def system(self) -> LinearSystem:
-        """Return the matrices, which any other linear-Gaussian formula may use."""
+        """Return the matrices of the system."""
         one = torch.ones(1, 1, dtype=torch.float64)
         return LinearSystem(
             transition=self.coefficient * one,

@@ -1,4 +1,4 @@
-"""The mirror sensor: it sees how far the state is from zero, never on which side; the belief has two equal modes."""
+"""The mirror sensor: only the distance of the state from zero is observed, so the belief has two equal modes."""
 
 import torch
 from torch import Tensor
@@ -10,21 +10,21 @@ from forbes.pomdps.grid import Grid, grid_filter
 __all__ = ["MirrorSensor"]
 
 HALF_WIDTH = 6.0
-"""Six standard deviations of the first state, which no later one exceeds."""
+"""Half-width of the grid: six standard deviations of the first state, which is the widest."""
 
 
 class MirrorSensor(Process):
-    r"""An autoregressive state of which only the absolute value is seen.
+    r"""An autoregressive state with noisy observations of its absolute value.
 
     .. math:: s_1 \sim N(0, 1), \qquad s_t = 0.95\, s_{t-1} + N(0, 0.3^2), \qquad o_t = |s_t| + N(0, \sigma^2)
 
-    Defined here. The belief is symmetric at every step: a Gaussian of the same moments is 1.16 nats per step away from
-    it (forward KL, T = 30), and a belief that has lost one mode predicts the observations as well as one with both.
+    The process is defined here. The belief is symmetric at every step. A Gaussian with the same moments is 1.16 nats
+    per step away from it (forward KL, T = 30). A belief that has lost one mode predicts the observations equally well.
 
     Args:
-        observation_std: :math:`\sigma`.
-        cells: of the grid on [-6, 6]. 1601 have a thirteenth of the default :math:`\sigma` as width and an error of
-            1e-7 nats in log p(o_1:30); 401 have 1e-5.
+        observation_std: standard deviation of the observations, :math:`\sigma`.
+        cells: number of cells of the grid on [-6, 6]. With 1601, a cell is a thirteenth of the default :math:`\sigma`
+            wide, and log p(o_1:30) has an error of 1e-7 nats; with 401, 1e-5.
 
     Example:
         >>> process = forbes.MirrorSensor()
@@ -40,7 +40,7 @@ class MirrorSensor(Process):
     def __init__(self, observation_std: float = 0.1, cells: int = 1601) -> None:
         require_positive("MirrorSensor", observation_std=observation_std, cells=cells - 1)
         self.observation_std = observation_std
-        self.grid = Grid.around_kink(-HALF_WIDTH, HALF_WIDTH, cells, kink=0.0)  # of |s|
+        self.grid = Grid.around_kink(-HALF_WIDTH, HALF_WIDTH, cells, kink=0.0)  # |s| has a kink at 0
 
     def initial(self, like: Tensor) -> DiagonalGaussian:
         """See `Process.initial`."""

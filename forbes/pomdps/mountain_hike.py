@@ -1,4 +1,4 @@
-"""The mountain hike of DVRL: a walk in the plane with actions, whose belief is Gaussian, or a mixture of three."""
+"""The mountain hike of DVRL: a walk in the plane, whose belief is a Gaussian or a mixture of three Gaussians."""
 
 import math
 from typing import Literal, get_args
@@ -30,25 +30,26 @@ HEIGHT, SHARPNESS, OUTSIDE, EFFORT = 4.0, 4.0, -6.0, 0.1
 
 
 class MountainHike(Process):
-    r"""A hiker who knows each step taken but not where it led, and sees a noisy position.
+    r"""A hiker with noisy steps and noisy observations of the position.
 
     .. math:: s_1 \sim \tfrac1K \sum_k N(m_k, 0.1^2 I), \qquad s_t = s_{t-1} + c(a_{t-1}) + N(0, 0.025^2 I), \qquad
               o_t = 10\,(s_t + N(0, \sigma^2 I)), \qquad c(a) = a \min(1, 0.05 / \lVert a \rVert)
 
-    "single" starts at (-0.85, -0.85) (Igl et al., 2018, arXiv 1806.02426): its belief is a Kalman filter's. "multi"
-    starts at one of three corners (Ma et al., 2020, arXiv 2002.09884, `mode: multi`): its belief is exactly a mixture
-    of three Gaussians. Numbers are those of `mountainHike.yaml` in both repositories; nothing stops the hiker at the
-    border. Left out: DPFRL's vector of pure noise. An episode has 75 steps there.
+    "single" starts at (-0.85, -0.85) (Igl et al., 2018, arXiv 1806.02426): its belief is that of a Kalman filter.
+    "multi" starts at one of three corners (Ma et al., 2020, arXiv 2002.09884, `mode: multi`): its belief is exactly a
+    mixture of three Gaussians. Parameters are those of `mountainHike.yaml` in both repositories. Nothing stops the
+    hiker at the border. DPFRL's additional noise observation is omitted. An episode has 75 steps there.
 
-    The reward is high on three ridges that lead from the start to the right, where it is highest (`reward`). It tells
-    about the state; the filter, which is not given it, is exact for whoever does not see it either.
+    The reward is high on three ridges that lead from the start to the right, where it is highest (`reward`). It carries
+    information about the state, which the filter does not use: it is exact for an agent that does not see the reward.
 
-    Actions of `sample` are N(0, 0.05² I), independent over time; three in five are longer than a step can be, and cut.
+    Actions of `sample` are N(0, 0.05² I), independent over time; three in five exceed the maximal step and are cut.
 
     Args:
         start: "single" or "multi".
-        observation_std: :math:`\sigma`; 0.1 as in DPFRL's command (the file has 0). Several starts are then told apart
-            at once. With 1.5, no start has more than 95 % in half of the beliefs after 5 steps, in a fifth after 10.
+        observation_std: standard deviation of the observations, :math:`\sigma`; 0.1 as in DPFRL's command (the file
+            has 0). With 0.1, several starts are distinguished immediately. With 1.5, half of the beliefs have no start
+            with more than 95 % after 5 steps, and a fifth after 10 steps.
 
     Example:
         >>> process = forbes.MountainHike()
@@ -86,12 +87,12 @@ class MountainHike(Process):
         return DiagonalGaussian(BOX_SCALE * state, BOX_SCALE * self.observation_std)
 
     def reward(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        r"""See `Process.reward`: the height of the place (x, y) reached, and the effort, as in both repositories.
+        r"""See `Process.reward`: height of the new position (x, y) minus effort, as in both repositories.
 
         .. math:: r = 4\,(1 - (1 - h)^4) - 4.5 + \tfrac{x + y}{4} - 0.1\,\lVert a \rVert, \qquad
                   h = \max_k \tfrac{w_k}{3}\, N((x, y); m_k, \mathrm{diag}(\sigma_k^2))
 
-        and -6 in place of the height outside of [-1, 1]^2; a is the action before it is cut.
+        with -6 instead of the height outside of [-1, 1]^2; a is the action before it is cut.
         """
         ridges = []
         for centre, std, weight in RIDGES:
@@ -114,14 +115,14 @@ class MountainHike(Process):
         return kalman_filter(self.system(), observation, step_of(action))
 
     def exact_smoothing_conditional(self, observation: Tensor, action: Tensor) -> AffineGaussian | None:
-        """See `Process.exact_smoothing_conditional`; with several starts the first of them is a mixture: None."""
+        """See `Process.exact_smoothing_conditional`; None for several starts, since it is a mixture at t = 1."""
         observation, action = self.checked(observation, action)
         if self.start == "multi":
             return None
         return smoothing_conditional(self.system(), observation, step_of(action))
 
     def system(self) -> LinearSystem:
-        """Return the matrices, which any other linear-Gaussian formula may use."""
+        """Return the matrices of the system."""
         unit = torch.eye(2, dtype=torch.float64)
         return LinearSystem(
             transition=unit,
@@ -134,6 +135,6 @@ class MountainHike(Process):
 
 
 def step_of(action: Tensor) -> Tensor:
-    """Return c(a), the action cut to the length of a step, `(*, 2)`."""
+    """Return c(a), the action cut to the maximal length of a step, `(*, 2)`."""
     length: Tensor = torch.linalg.vector_norm(action, dim=-1, keepdim=True)
     return action * (MAX_STEP / length.clamp(min=MAX_STEP))

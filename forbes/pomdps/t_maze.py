@@ -1,4 +1,4 @@
-"""The T-maze: a sign seen at the start says which way to turn at the end."""
+"""The T-maze: a sign at the start shows which way to turn at the end."""
 
 import torch
 from torch import Tensor
@@ -17,22 +17,22 @@ SIGN_UP, SIGN_DOWN, CORRIDOR, CROSSROAD = range(4)
 class TMaze(FiniteProcess):
     r"""A corridor of L steps that ends at a crossroad.
 
-    Its places, and what is seen at them::
+    Its positions and observations::
 
-                        |L + 1|     the goal is up or down, as the sign at 0 says;
-        |0|.|.|.|.|.|.|.|  L  |     what is seen: sign up, sign down, corridor,
-                        |L + 2|     or (at L and behind it) crossroad
+                        |L + 1|     the goal is up or down, as the sign at 0 shows;
+        |0|.|.|.|.|.|.|.|  L  |     observations: sign up, sign down, corridor,
+                        |L + 2|     or (at L, L + 1 and L + 2) crossroad
 
-    With probability :math:`\lambda` an action is replaced by one of the four at random; one that leads into a wall
-    has no effect, and L + 1 and L + 2 are never left. Bakker (2001); numbers, observations and policy as in Lambrechts
-    et al. (2022, arXiv 2208.03520, `tmaze.py` of *belief-rnn*), who play 3 L / (1 - λ) steps.
+    With probability :math:`\lambda` an action is replaced by a random one of the four. An action into a wall has no
+    effect, and L + 1 and L + 2 are never left. The problem is from Bakker (2001); parameters, observations and policy
+    are those of Lambrechts et al. (2022, arXiv 2208.03520, `tmaze.py` of *belief-rnn*), who play 3 L / (1 - λ) steps.
 
-    State i is at place i mod (L + 3), with the goal up for i < L + 3; actions are right, up, left, down. Those of
+    State i is at position i mod (L + 3), with the goal up for i < L + 3. Actions are right, up, left, down. Those of
     `sample` go right with probability 1/2.
 
     Args:
-        length: L.
-        stochasticity: :math:`\lambda` in [0, 1]; 0.2 is the other published setting.
+        length: number of steps to the crossroad, L.
+        stochasticity: probability of a random action, :math:`\lambda`, in [0, 1]; 0.2 is the other published setting.
 
     Example:
         >>> process = forbes.TMaze(length=5)
@@ -56,7 +56,7 @@ class TMaze(FiniteProcess):
         start[:, 0] = 0.5
         super().__init__(
             initial=start.flatten(),  # (2 P,)
-            transition=torch.stack([torch.block_diag(each, each) for each in walk]),  # (4, 2 P, 2 P)
+            transition=torch.stack([torch.block_diag(table, table) for table in walk]),  # (4, 2 P, 2 P)
             emission=one_hot(seen.flatten(), 4).double(),  # (2 P, 4)
             policy=torch.tensor([3.0, 1.0, 1.0, 1.0], dtype=torch.float64) / 6,
         )
@@ -64,19 +64,19 @@ class TMaze(FiniteProcess):
     def reward(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
         """See `Process.reward`: 4 at the goal, -0.1 at the other end and for standing still, else 0 (`tmaze.py`)."""
         before, after = state.argmax(-1), next_state.argmax(-1)  # (*)
-        goal = self.length + 1 + torch.tensor([0, self.length + 4], device=state.device)  # up; down, in the second half
+        goal = self.length + 1 + torch.tensor([0, self.length + 4], device=state.device)  # up (i < L + 3), and down
         reached = (after.unsqueeze(-1) == goal).any(-1)  # (*)
         lost = (before == after) | self.terminal(next_state) & ~reached
         reward = 4.0 * reached.to(state) - 0.1 * lost.to(state)
         return reward.where(~self.terminal(state), 0.0)
 
     def terminal(self, state: Tensor) -> Tensor:
-        """See `Process.terminal`: both ends."""
+        """See `Process.terminal`: L + 1 and L + 2."""
         return state.argmax(-1) % (self.length + 3) > self.length
 
 
 def next_place(length: int, action: int) -> Tensor:
-    """Return the place that an action leads to from each of the L + 3, int64."""
+    """Return the position to which an action leads from each of the L + 3 positions, int64."""
     place = torch.arange(length + 3)
     after = place.clone()
     if action == RIGHT:

@@ -1,4 +1,4 @@
-"""The univariate nonstationary growth model, the classic of non-linear filtering: its belief has two unequal modes."""
+"""The univariate nonstationary growth model, a classic of non-linear filtering: its belief has two unequal modes."""
 
 import math
 
@@ -13,18 +13,19 @@ __all__ = ["Ungm"]
 
 
 class Ungm(Process):
-    r"""A state that jumps between two wells, seen by its square.
+    r"""A state that jumps between two wells, with noisy observations of its square.
 
     .. math:: s_1 \sim N(0, 4), \qquad s_t = \frac{s_{t-1}}{2} + \frac{25\, s_{t-1}}{1 + s_{t-1}^2} + 8\, a_{t-1} +
               N(0, 10), \qquad o_t = \frac{s_t^2}{20} + N(0, 1)
 
     Gordon, Salmond and Smith (1993, IEE Proceedings F 140); the first variance is that of the library *particles*
-    (`Gordon_etal`). The model's clock is its action, :math:`a_t = \cos(1.2\,(t-1))`, so that whoever knows the
-    actions knows the time, and one step is like another. At 61 % of the steps (T = 30) more than 5 % of the belief
-    lies on the less likely side of zero.
+    (`Gordon_etal`). The time dependence of the model is its action, :math:`a_t = \cos(1.2\,(t-1))`, so that the
+    transition is the same at every step. At 61 % of the steps (T = 30) more than 5 % of the belief is on the less
+    likely side of zero.
 
     Args:
-        cells: of the grid on [-45, 45]. 901 have an error of 1e-9 nats in log p(o_1:30), 451 of 4e-4.
+        cells: number of cells of the grid on [-45, 45]. With 901, log p(o_1:30) has an error of 1e-9 nats; with 451,
+            4e-4.
 
     Example:
         >>> process = forbes.Ungm()
@@ -54,7 +55,7 @@ class Ungm(Process):
         return DiagonalGaussian(state.square() / 20, 1.0)
 
     def policy(self, sequences: int, steps: int, generator: torch.Generator) -> Tensor:
-        """See `Process.policy`: the clock, the same for all sequences."""
+        """See `Process.policy`: the cosine, the same for all sequences."""
         time = torch.arange(steps, dtype=torch.float64)  # t - 1
         return (1.2 * time).cos().view(1, -1, 1).expand(sequences, -1, -1)  # (B, steps, 1)
 

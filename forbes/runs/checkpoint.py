@@ -1,4 +1,4 @@
-"""Checkpoints that survive a kill at any instant: written beside, verified, then renamed over the old one."""
+"""Checkpoints that survive a kill at any time: written to a temporary file, verified, then renamed."""
 
 import hashlib
 import io
@@ -32,34 +32,34 @@ __all__ = [
 
 
 class CheckpointFile(NamedTuple):
-    """A checkpoint as it was read."""
+    """The content of a checkpoint and its hash."""
 
     content: dict[str, Any]
     sha256: str
-    """Of the bytes that `content` was read from: the file may hold others by now."""
+    """SHA-256 of the bytes from which `content` was read. The file may have been replaced since."""
 
 
 class DamagedCheckpointError(ForbesError):
-    """A file is not what was written."""
+    """A file is truncated or damaged."""
 
 
 class UntrustedCheckpointError(ForbesError):
-    """A file holds more than tensors and plain values."""
+    """A file has other objects than tensors and plain values."""
 
 
 class AtomicCheckpointIO(CheckpointIO):
-    """Holds, at every instant, nothing or a whole checkpoint at the path; loads only tensors and plain values.
+    """Writes checkpoints atomically, and loads only tensors and plain values.
 
-    Lightning's own writes to the system's temporary folder, from where the file is copied over the old checkpoint,
-    and a full disk leaves half of it.
+    Lightning's own plugin writes to the system's temporary folder and copies the file over the old checkpoint, so a
+    full disk leaves a truncated checkpoint.
     """
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
     ) -> None:
-        """Write another file in the same folder, verify it, and rename it to `path`."""
+        """Write a temporary file in the same folder, verify it, and rename it to `path`."""
         path = Path(path)
-        buffer = io.BytesIO()  # written to a full disk directly, torch.save fails without saying why
+        buffer = io.BytesIO()  # on a full disk, torch.save to a file fails without a reason
         torch.save(checkpoint, buffer)
 
         def keep_others(written: Path) -> None:
@@ -67,7 +67,7 @@ class AtomicCheckpointIO(CheckpointIO):
             if path.name == RunFolder.LAST:
                 if checkpoint.get("best", {}).get("update", -1) == checkpoint.get("global_step"):
                     _name_too(written, RunFolder.BEST)
-                if path.exists() and _is_whole(path):  # one that is not is worth less than the one before it
+                if path.exists() and _is_intact(path):  # a damaged one must not replace the previous one
                     _name_too(path, RunFolder.PREVIOUS)
 
         replace_file(path, _sealed(buffer.getvalue()), keep_others)
@@ -75,7 +75,7 @@ class AtomicCheckpointIO(CheckpointIO):
     def load_checkpoint(
         self, path: str | os.PathLike[str], map_location: Any | None = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read a checkpoint to the CPU; never unpickles objects, whatever `weights_only` says."""
+        """Read a checkpoint to the CPU. Objects are never unpickled, regardless of `weights_only`."""
         return read_checkpoint(Path(path))
 
     def remove_checkpoint(self, path: str | os.PathLike[str]) -> None:
@@ -84,15 +84,15 @@ class AtomicCheckpointIO(CheckpointIO):
 
 
 class SaveLast(Checkpoint):
-    """Saves after each epoch, whose metrics are logged before; the checkpoint before becomes `previous.ckpt`.
+    """Saves `last.ckpt` after each epoch and its metrics; the checkpoint before it becomes `previous.ckpt`.
 
-    The best one stays as `best.ckpt`: that with the highest `return/acting` of an agent, otherwise with the highest
-    bound of the validation, or its lowest loss. Of equals it is the first. A run that measures neither has none.
+    The best checkpoint is kept as `best.ckpt`: the one with the highest `return/acting` of an agent, otherwise the
+    highest validation bound or lowest validation loss; of equal ones the first. Without such a metric there is none.
 
-    Lightning's `ModelCheckpoint` remembers where it saved, and is lost in a run folder that was moved.
+    Lightning's `ModelCheckpoint` stores absolute paths, which break when a run folder is moved.
 
     Args:
-        run: where the checkpoint goes.
+        run: run folder to save to.
     """
 
     def __init__(self, run: RunFolder) -> None:
@@ -100,15 +100,15 @@ class SaveLast(Checkpoint):
         self._best: dict[str, Any] = {}  # metric, value and update
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Write into a checkpoint which is the best up to it; as state of a callback, other loops would ask for it."""
+        """Store the best value so far; as state of the callback, other loops would require it."""
         checkpoint["best"] = self._best
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Go on from there; an older version did not write it."""
+        """Restore the best value so far; checkpoints of older versions do not have it."""
         self._best = checkpoint.get("best", {})
 
     def _compare(self, trainer: Trainer, module: LightningModule) -> None:
-        """Note whether the checkpoint that follows is the best."""
+        """Update the best value, before the checkpoint is saved."""
         metrics, objective = trainer.callback_metrics, getattr(module, "objective_name", "loss")
         metric = "return/acting" if "return/acting" in metrics else f"val/{objective}"
         value = float(metrics.get(metric, math.nan))
@@ -119,20 +119,20 @@ class SaveLast(Checkpoint):
             self._best = {"metric": metric, "value": value, "update": trainer.global_step}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Estimate the room: weights and Adam's two moments, of the last, the previous, the best and a new checkpoint.
+        """Check the free disk space for four checkpoints with weights and Adam's two moments.
 
         Raises:
-            ForbesError: where not even the weights fit once.
+            ForbesError: if not even the weights fit once.
         """
         weights = sum(values.numel() * values.element_size() for values in pl_module.state_dict().values())
         missing = 4 - len([*self.run.checkpoint.parent.glob("*.ckpt")])
         require_room(self.run.path, "checkpoints", likely=3 * weights * max(missing, 1), least=weights)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log the metrics of the epoch and save; every other callback has ended its epoch.
+        """Log the metrics of the epoch and save. All other callbacks have finished the epoch.
 
-        Lightning counts an epoch that `max_steps` or `max_time` has cut short as done, and a resumed run would miss the
-        rest of it. In the checkpoint it is not.
+        Lightning counts an epoch that was cut short by `max_steps` or `max_time` as completed, and a resumed run would
+        skip its rest. In the checkpoint it is not counted.
         """
         _log_epoch(trainer)
         self._compare(trainer, pl_module)
@@ -145,9 +145,9 @@ class SaveLast(Checkpoint):
 
 
 def _log_epoch(trainer: Trainer) -> None:
-    """Log what the epoch has measured, as Lightning does after the checkpoint, where a kill would lose it.
+    """Log the metrics of the epoch. Lightning does this after the checkpoint, where a kill would lose them.
 
-    What is logged is forgotten, so that Lightning then has nothing to log.
+    Logged metrics are cleared, so Lightning does not log them again.
     """
     loggers, loop = cast(Any, trainer)._logger_connector, trainer.fit_loop.epoch_loop
     loggers.on_epoch_end()
@@ -157,33 +157,33 @@ def _log_epoch(trainer: Trainer) -> None:
 
 
 class ResumeWholeEpochs(Callback):
-    """Lets a training with `max_steps` go on from the end of an epoch.
+    """Lets a training with `max_steps` resume from the end of an epoch.
 
-    Lightning 2.6 takes every checkpoint for one of the middle of an epoch where `max_steps` is set, and ends that epoch
-    twice. So the limit is out of its sight while it loads the checkpoint.
+    If `max_steps` is set, Lightning 2.6 assumes that every checkpoint is from the middle of an epoch, and ends that
+    epoch twice. So the limit is removed while the checkpoint is loaded.
     """
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take the limit away; the checkpoint is loaded next."""
+        """Remove the limit before the checkpoint is loaded."""
         self._max_steps, trainer.fit_loop.epoch_loop.max_steps = trainer.max_steps, -1
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Set it again."""
+        """Restore the limit."""
         trainer.fit_loop.epoch_loop.max_steps = self._max_steps
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Return the content of a checkpoint; see `open_checkpoint`."""
+    """Verify a checkpoint and return its content on the CPU, as `open_checkpoint` does."""
     return open_checkpoint(path).content
 
 
 def open_checkpoint(path: Path) -> CheckpointFile:
-    """Verify and read a checkpoint to the CPU. The file is read once, so that content and hash belong together.
+    """Verify and read a checkpoint to the CPU. The file is read once, so content and hash belong together.
 
-    Where `last.ckpt` is damaged, the one before it is read, and stderr says so.
+    If `last.ckpt` is damaged, the previous one is read, with a warning on stderr.
 
     Raises:
-        ForbesError: when the file is missing, damaged, or holds more than tensors and plain values.
+        ForbesError: if the file is missing, damaged, or has other objects than tensors and plain values.
     """
     previous = path.with_name(RunFolder.PREVIOUS)
     try:
@@ -191,9 +191,9 @@ def open_checkpoint(path: Path) -> CheckpointFile:
     except DamagedCheckpointError as error:
         if path.name != RunFolder.LAST or not previous.is_file():
             raise
-        found = _open(previous)
+        checkpoint = _open(previous)
         print(f"WARNING: {error}: reading {previous}", file=sys.stderr)
-        return found
+        return checkpoint
 
 
 def _open(path: Path) -> CheckpointFile:
@@ -206,16 +206,16 @@ def _open(path: Path) -> CheckpointFile:
             checkpoint: dict[str, Any] = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
         except pickle.UnpicklingError as error:
             raise UntrustedCheckpointError(
-                f"{path}: refused, it holds more than tensors and plain values. Do not trust it"
+                f"{path}: refused, it has other objects than tensors and plain values. Do not trust it"
             ) from error
     return CheckpointFile(checkpoint, hashlib.sha256(content).hexdigest())
 
 
 def _verify(path: Path, content: bytes) -> None:
-    """Compare the file with its seal; torch.load itself reads flipped bits without a word.
+    """Verify the hash at the end of the file, since torch.load does not detect flipped bits.
 
-    A file without one, of an older version or other software, has the checksums of its members. They leave out the
-    directory, where a flipped bit makes a member a folder, of which torch reads zeros.
+    A file without the hash, from an older version or other software, has only the checksums of its members. These do
+    not cover the archive's directory, where a flipped bit turns a member into a folder, which torch reads as zeros.
     """
     with (
         readable(path, "a checkpoint", "Take another one", DamagedCheckpointError),
@@ -228,22 +228,20 @@ def _verify(path: Path, content: bytes) -> None:
             f"{path}: the checkpoint is damaged (wrong checksum of {damaged}). Take another one"
         )
     if not whole:
-        raise DamagedCheckpointError(
-            f"{path}: truncated or damaged (its SHA-256 is not what it says). Take another one"
-        )
+        raise DamagedCheckpointError(f"{path}: truncated or damaged (its SHA-256 does not match). Take another one")
 
 
-_FOLDER = 0x10  # of the attributes of a member
+_FOLDER = 0x10  # attribute of a member that is a folder
 _SEAL = b"sha256 "
 
 
 def _sealed(content: bytes) -> bytes:
-    """Append the hash of a zip file to it, as the archive's comment, whose length are the last two bytes before."""
+    """Append its own hash to a zip file as the archive's comment. The two bytes before it are the comment's length."""
     begun = content[:-2] + (len(_SEAL) + 64).to_bytes(2, "little") + _SEAL
     return begun + hashlib.sha256(begun).hexdigest().encode()
 
 
-def _is_whole(path: Path) -> bool:
+def _is_intact(path: Path) -> bool:
     try:
         _verify(path, path.read_bytes())
     except DamagedCheckpointError:
@@ -252,12 +250,12 @@ def _is_whole(path: Path) -> bool:
 
 
 def _name_too(path: Path, name: str) -> None:
-    """Name a file a second time in its folder, in place of the file with that name; copy it where links are unknown."""
-    aside = path.with_name(f".{name}.part")
-    aside.unlink(missing_ok=True)
+    """Give a file a second name in its folder, replacing the file of that name: a hard link, or a copy."""
+    temporary = path.with_name(f".{name}.part")
+    temporary.unlink(missing_ok=True)
     try:
-        os.link(path, aside)
+        os.link(path, temporary)
     except OSError:  # a file system without hard links
-        shutil.copyfile(path, aside)
-    aside.replace(path.with_name(name))
-    aside.unlink(missing_ok=True)  # a rename does nothing where both are names of one file already
+        shutil.copyfile(path, temporary)
+    temporary.replace(path.with_name(name))
+    temporary.unlink(missing_ok=True)  # the rename has no effect if both names already link to one file

@@ -1,4 +1,4 @@
-"""Errors of the configuration, from jsonargparse's pages to one sentence that names the nearest valid word."""
+"""Errors of the configuration: turn jsonargparse's messages into one sentence with the nearest valid name."""
 
 import argparse
 import difflib
@@ -7,9 +7,10 @@ import itertools
 import pydoc
 import re
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
@@ -21,66 +22,106 @@ from forbes.reading import shortened
 
 __all__ = ["building", "one_sentence", "raised_inside", "said_by_lightning"]
 
-_LENGTH = 200  # characters of a sentence without its place; some of the libraries print a whole configuration
+_LENGTH = 200  # characters of a message; the libraries' own may contain a whole configuration
 
 TOP_LEVEL = ("model", "data", "trainer", "seed_everything", "config", "ckpt_path")
 SECTIONS = {"data.source": SequenceSource, "data": SequenceDataModule, "trainer": Trainer, "model": LightningModule}
 CONFIGURABLE = (nn.Module, LightningDataModule, SequenceSource, Callback, Logger)
 
 
+class _Complaint(NamedTuple):
+    """What is wrong with a configuration."""
+
+    key: str
+    """Key of the configuration, or empty."""
+    sentence: str
+    file: str = ""
+    """File that the sentence is about, if it is not about a key."""
+
+
 def one_sentence(message: str, arguments: Sequence[str] = ()) -> str:
-    """Say where a configuration is wrong, and what to write instead.
+    """Return one sentence that says where a configuration is wrong, and what to write instead.
 
     Args:
-        message: what jsonargparse says, many lines with the way through the nested types.
-        arguments: of the command line, to tell a flag from a line of the file.
+        message: message of jsonargparse, with many lines about nested types.
+        arguments: command line, to distinguish a wrong flag from a wrong line in a file.
     """
-    keys = re.findall(r'Parser key "([\w.]+)"', message)
-    if found := re.search(r"unrecognized arguments: (\S+\.ya?ml)\b", message):
-        return f"{found[1]}: a configuration needs its flag. Say: --config {found[1]}"
-    if found := re.search(r"[Oo]ption '([\w.]+)'|unrecognized arguments: --([\w.]+)", message):
-        key, sentence = _unknown_option(message, keys, found[1] or found[2])
-    elif found := re.search(r"Expected a dot import path string: (\S*)|has no attribute '(\w+)'", message):
-        key, sentence = ".".join(keys), _unknown_class(found[1] or found[2] or "''")
-    elif found := re.search(r"Importing '([\w.]+)' is not allowed", message):
-        module = found[1].rpartition(".")[0]
-        key = ".".join(keys)
-        sentence = f"{found[1]} is not a class of forbes or Lightning. If you trust it, add: --allow-module {module}"
-    elif found := re.search(r"arguments are required: ([\w., ]+)", message):
-        key, sentence = ".".join(keys), f"{found[1]} missing, {_supply('.'.join(keys), found[1])}"
-    elif found := re.search(r"File does not exist: '(.*)'", message):
-        return f"{found[1]}: no such file. See configs/ for those that come with forbes"
-    else:
-        key, sentence = ".".join(keys), _wrong_value(message)
+    key, sentence, file = _complaint(message, re.findall(r'Parser key "([\w.]+)"', message))
+    if file:
+        return f"{file}: {sentence}"
     return f"{_place(key, arguments)}{key + ': ' if key else ''}{shortened(sentence, _LENGTH)}"
 
 
-def _supply(key: str, missing: str) -> str:
-    """Say how to give what is missing: of a class, or of the whole configuration."""
-    if not key:
-        return "give a configuration: --config configs/strokes/forbes.yaml"
-    return f"give it: --{key}.{missing} VALUE"
+def _complaint(message: str, keys: list[str]) -> _Complaint:
+    """Explain a message by the first rule that matches, or as a wrong value."""
+    for pattern, explain in _RULES:
+        if match := re.search(pattern, message):
+            return explain(match, message, keys)
+    return _Complaint(".".join(keys), _wrong_value(message))
 
 
-def _unknown_option(message: str, keys: list[str], option: str) -> tuple[str, str]:
-    """Name an option that a class, the trainer or the whole configuration does not have."""
+def _missing_flag(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    return _Complaint("", f"a configuration needs its flag. Write: --config {match[1]}", match[1])
+
+
+def _missing_file(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    return _Complaint("", "no such file. The configurations of forbes are in configs/", match[1])
+
+
+def _missing_argument(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    """Explain a missing argument of a class, or a missing configuration."""
+    key = ".".join(keys)
+    remedy = (
+        f"give it: --{key}.{match[1]} VALUE" if key else "give a configuration: --config configs/strokes/forbes.yaml"
+    )
+    return _Complaint(key, f"{match[1]} missing, {remedy}")
+
+
+def _unknown_option(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    """Explain an option that a class, the trainer or the configuration does not have."""
+    option = match[1] or match[2]
     if group := re.search(r"Group '(\w+)'", message):
         keys = [group[1], *keys]
     path = [*keys, *option.removesuffix(".class_path").split(".")]
     owners = re.findall(r"class_path[= ]'([\w.]+)'", message)
-    if owners and pydoc.locate(owners[-1]) is None:  # a short name, which jsonargparse took for one of the arguments
-        return ".".join(keys), f"{owners[-1]}: expected init_args beside class_path, found {option.split('.')[0]}"
+    if owners and pydoc.locate(owners[-1]) is None:  # a short name, with arguments that are not in init_args
+        sentence = f"{owners[-1]}: expected init_args next to class_path, found {option.split('.')[0]}"
+        return _Complaint(".".join(keys), sentence)
     if owners:
         owner, valid = owners[-1].rpartition(".")[2], list(inspect.signature(pydoc.locate(owners[-1])).parameters)  # type: ignore[arg-type]
     elif path[0] == "trainer":
         owner, valid = "Trainer", list(inspect.signature(Trainer).parameters)
     else:
-        return path[0], f"the configuration has no such option{_nearest_of_all(path[0])}"
-    return ".".join(path), f"{owner} has no such option{_nearest(path[-1], valid)}"
+        return _Complaint(path[0], f"the configuration has no such option{_nearest_of_all(path[0])}")
+    return _Complaint(".".join(path), f"{owner} has no such option{_nearest(path[-1], valid)}")
+
+
+def _unknown_class(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    """Explain a class that does not exist, or has the wrong type."""
+    name = match[1] or match[2] or "''"
+    nearest = _nearest(name, sorted(_class_names() - {name}))
+    return _Complaint(".".join(keys), f"no class {name} that fits here{nearest}")
+
+
+def _untrusted_class(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    module = match[1].rpartition(".")[0]
+    sentence = f"{match[1]} is not a class of forbes or Lightning. If you trust it, add: --allow-module {module}"
+    return _Complaint(".".join(keys), sentence)
+
+
+_RULES: tuple[tuple[str, Callable[[re.Match[str], str, list[str]], _Complaint]], ...] = (
+    (r"unrecognized arguments: (\S+\.ya?ml)\b", _missing_flag),
+    (r"[Oo]ption '([\w.]+)'|unrecognized arguments: --([\w.]+)", _unknown_option),
+    (r"Expected a dot import path string: (\S*)|has no attribute '(\w+)'", _unknown_class),
+    (r"Importing '([\w.]+)' is not allowed", _untrusted_class),
+    (r"arguments are required: ([\w., ]+)", _missing_argument),
+    (r"File does not exist: '(.*)'", _missing_file),
+)
+"""Patterns in the messages of jsonargparse 4.53, and the functions that explain them."""
 
 
 def _nearest_of_all(option: str) -> str:
-    """Suggest the option of the whole configuration whose last word is the nearest."""
+    """Suggest the nearest option of the whole configuration, by its last part."""
     places = {name: f"{section}.{name}" for section, kind in SECTIONS.items() for name in _arguments(kind)}
     places |= {name: name for name in TOP_LEVEL}
     near = difflib.get_close_matches(option, places, n=1)
@@ -88,24 +129,19 @@ def _nearest_of_all(option: str) -> str:
 
 
 def _arguments(kind: type) -> set[str]:
-    """Return the arguments of a class and of all of ours that derive from it."""
-    ours = [each for each in _derived([kind]) if each is kind or each.__module__.startswith("forbes.")]
-    return {name for each in ours for name in inspect.signature(each).parameters}
-
-
-def _unknown_class(name: str) -> str:
-    """Name a class that does not exist, or exists and is of another kind."""
-    return f"no class {name} that fits here{_nearest(name, sorted(_class_names() - {name}))}"
+    """Return the arguments of a class and of its subclasses in forbes."""
+    ours = [derived for derived in _derived([kind]) if derived is kind or derived.__module__.startswith("forbes.")]
+    return {name for derived in ours for name in inspect.signature(derived).parameters}
 
 
 def _class_names() -> set[str]:
-    """Return the names of the classes a configuration may name."""
+    """Return the names of the classes that a configuration may use."""
     found = _derived(CONFIGURABLE)
     return {kind.__name__ for kind in found if kind.__module__.split(".")[0] != "torch" and kind.__name__[0] != "_"}
 
 
 def _derived(kinds: Sequence[type]) -> set[type]:
-    """Return classes with all that derive from them."""
+    """Return classes and all their subclasses."""
     found: set[type] = set()
     pending = list(kinds)
     while pending:
@@ -117,7 +153,7 @@ def _derived(kinds: Sequence[type]) -> set[type]:
 
 
 def _nearest(word: str, valid: Sequence[str]) -> str:
-    """Suggest the nearest valid word, or give a short list whole."""
+    """Suggest the nearest valid name, or list all names if there are at most ten."""
     near = difflib.get_close_matches(word, valid, n=1)
     if near:
         return f", did you mean {near[0]}?"
@@ -125,7 +161,7 @@ def _nearest(word: str, valid: Sequence[str]) -> str:
 
 
 def _wrong_value(message: str) -> str:
-    """Say which value was given and what was expected; keep the library's words where they are short already."""
+    """Return the given and the expected value; keep other messages of the library as they are."""
     expected = re.search(r"Expected a (.+?)\. Got value: ([^\n]+?)(?:\. Got value|\n|$)", message)
     if expected is None and "Subtypes" in message:
         expected = re.search(r"Subtypes: \[(.+?)\]\n.*Given value: ([^\n]*)", message, re.DOTALL)
@@ -136,7 +172,7 @@ def _wrong_value(message: str) -> str:
 
 
 def _place(key: str, arguments: Sequence[str]) -> str:
-    """Name the configuration file, unless a flag is to blame."""
+    """Return the configuration file of a wrong key, or nothing if a flag is wrong."""
     flags = [argument.split("=")[0].replace(".init_args", "") for argument in arguments if argument.startswith("--")]
     if key and f"--{key}" in flags:
         return ""
@@ -149,7 +185,7 @@ def _place(key: str, arguments: Sequence[str]) -> str:
 
 
 def raised_inside(error: BaseException) -> ForbesError | None:
-    """Find the error of ours that a constructor has raised, under what jsonargparse makes of it."""
+    """Return the `ForbesError` in the chain of causes of an error that jsonargparse raises, if there is one."""
     inner: BaseException | None = error
     while inner is not None and not isinstance(inner, ForbesError):
         inner = inner.__cause__
@@ -158,28 +194,28 @@ def raised_inside(error: BaseException) -> ForbesError | None:
 
 @contextmanager
 def building(where: str) -> Iterator[None]:
-    """Turn an error inside a class that a configuration names into one sentence.
+    """Turn an error in the constructor of a configured class into one sentence.
 
     Args:
-        where: the configuration's name.
+        where: name of the configuration.
 
     Raises:
-        ForbesError: what the class or Lightning has said, or which error it has raised.
+        ForbesError: with the message of the class or of Lightning, or the type of the error.
     """
     try:
         yield
-    except (argparse.ArgumentError, OSError):  # said elsewhere
+    except (argparse.ArgumentError, OSError):  # handled by the caller
         raise
     except Exception as error:
         if inner := raised_inside(error):
             raise inner from None
         cause = f"{type(error).__name__}: {shortened(str(error), 120)}"
-        said = said_by_lightning(error) or f"{where}: what it names cannot be built ({cause}). Change it; see --debug"
+        said = said_by_lightning(error) or f"{where}: cannot be instantiated ({cause}). Change it; see --debug"
         raise ForbesError(said) from error
 
 
 def said_by_lightning(error: BaseException) -> str | None:
-    """Return the message of an error that Lightning itself has raised, as it does where it is misused; else None."""
+    """Return the message of an error that was raised by Lightning itself because of wrong usage, else None."""
     while error.__cause__ is not None:
         error = error.__cause__
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]

@@ -1,4 +1,4 @@
-"""What a configuration may name and what is linked to what; how a run's configuration becomes a model and its data."""
+"""Which classes a configuration may use, the links between its arguments, and its parser."""
 
 import importlib
 import os
@@ -34,26 +34,26 @@ TRUSTED = (
     *(f"lightning.pytorch.{part}" for part in _OF_LIGHTNING),
     "lightning.fabric.plugins",
 )
-"""Packages whose classes a configuration may name, and the public names of `import forbes`."""
-_REFUSED = ("*",)  # all else
+"""Packages whose classes a configuration may use, and the public names of `import forbes`."""
+_REFUSED = ("*",)  # everything else
 FAMILIES: tuple[type, ...] = (
     *(nn.Module, Likelihood, LightningDataModule, SequenceSource, Process, Callback, Logger, Profiler),
     *(Accelerator, CheckpointIO, ClusterEnvironment, LayerSync, Precision, Strategy),
 )
-"""What these classes derive from."""
-_BY_A_CLASS = "Name a class of forbes or Lightning, or one of your own with --allow-module MODULE"
-_allowed: dict[str, None] = {}  # in their order, as long as the process lives: jsonargparse keeps them too
+"""Base classes of the classes that a configuration may use."""
+_BY_A_CLASS = "Use a class of forbes or Lightning, or one of your own with --allow-module MODULE"
+_allowed: dict[str, None] = {}  # ordered; for the lifetime of the process, as in jsonargparse
 
 
 def allow_modules(names: Sequence[str] = ()) -> None:
-    """Let configurations name classes of `TRUSTED` and of the given modules, nothing else.
+    """Restrict configurations to classes of `TRUSTED` and of the given modules.
 
-    A configuration may come from anywhere, and to name a class is to import, hence to run, its module. A given module
-    is imported, from the working directory or as installed, so that its classes are known by their short names. Where
-    any value is accepted, a class that is named stays a name. See `require_classes` for what else is refused.
+    A configuration may come from an untrusted source, and using a class imports, hence runs, its module. The given
+    modules are imported, from the working directory or as installed, so that their classes have short names. In
+    arguments that accept any value, a class path remains a string. `require_classes` makes further checks.
 
     Raises:
-        ForbesError: when a given module does not exist.
+        ForbesError: if a given module does not exist.
     """
     if names and "" not in sys.path:
         sys.path.append("")
@@ -71,22 +71,22 @@ def allow_modules(names: Sequence[str] = ()) -> None:
 
 
 def allowed_modules() -> list[str]:
-    """Return the flags that let another process name the classes of the same modules."""
+    """Return the flags that allow the same modules in another process."""
     return [part for name in _allowed for part in ("--allow-module", name)]
 
 
 def require_classes(config: Any, key: str = "") -> None:
     """Refuse a parsed configuration that would call anything but a class of `FAMILIES` or of an allowed module.
 
-    jsonargparse compares classes with the type of the parameter, but calls any function, with the arguments of the
-    configuration, where a parameter is a Callable. A function of an allowed module may be given by its name alone.
+    jsonargparse checks classes against the type of a parameter. But if the parameter is a Callable, it calls any
+    function with the arguments of the configuration. A function of an allowed module may be given by name only.
 
     Args:
-        config: what jsonargparse has parsed and not yet instantiated, or a part of it.
-        key: of the part.
+        config: configuration as parsed by jsonargparse, before instantiation, or a part of it.
+        key: key of the part.
 
     Raises:
-        ForbesError: for the first name that is refused.
+        ForbesError: for the first refused name.
     """
     if isinstance(config, Namespace):
         config = vars(config)
@@ -98,14 +98,14 @@ def require_classes(config: Any, key: str = "") -> None:
     elif isinstance(config, list | tuple | set | frozenset):
         for value in config:
             require_classes(value, key)
-    elif not callable(config) or isinstance(config, os.PathLike):  # a path: of a file that a part was read from
+    elif not callable(config) or isinstance(config, os.PathLike):  # a path of a file from which a part was read
         return
     elif not _is_allowed(getattr(config, "__module__", None)):
         raise ForbesError(f"{key}: is a {type(config).__name__}, expected a class. {_BY_A_CLASS}")
 
 
 def _require_class(path: str, key: str) -> None:
-    """Refuse a path that is not that of a class; whatever was parsed is imported already."""
+    """Refuse a path that is not an allowed class; parsing has already imported it."""
     module, _, name = path.rpartition(".")
     kind = getattr(sys.modules.get(module), name, None)
     if not isinstance(kind, type) or not (issubclass(kind, FAMILIES) or _is_allowed(kind.__module__)):
@@ -113,22 +113,22 @@ def _require_class(path: str, key: str) -> None:
 
 
 def _is_allowed(module: str | None) -> bool:
-    """Tell whether a module, or the package it is in, was given to `allow_modules`."""
+    """Return whether a module, or a package that contains it, was given to `allow_modules`."""
     return any(f"{module}.".startswith(f"{name}.") for name in _allowed)
 
 
 def add_seed(parser: LightningArgumentParser) -> None:
-    """Add the one seed of an experiment."""
+    """Add the random seed of an experiment."""
     parser.add_argument(
         "--seed_everything",
         type=int,
         default=0,
-        help="seed of the weights, the noise, the order of the data and an agent's episodes",
+        help="random seed for weights, noise, order of the data and an agent's episodes",
     )
 
 
 def add_links(parser: LightningArgumentParser) -> None:
-    """Link the data's shapes, and whether its actions are discrete, to the model's arguments, and the seed to both."""
+    """Link the data's shapes and kind of actions to the model's arguments, and the seed to both."""
     for name in ("observation_shape", "action_dim", "discrete"):
         parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
     for part in ("model", "data"):
@@ -136,9 +136,9 @@ def add_links(parser: LightningArgumentParser) -> None:
 
 
 def changed_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return, by its key, what an older run did not write and had by a default that has changed since.
+    """Return the values, by key, that an older run had by a default that has changed since.
 
-    Strokes were whole frames before `frames` could be chosen.
+    Strokes were whole frames before the argument `frames` existed.
     """
     data = config.get("data")
     source = data.get("init_args", {}).get("source") if isinstance(data, dict) else None
@@ -148,12 +148,12 @@ def changed_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def data_paths(data: Namespace) -> dict[str, str]:
-    """Return the files and folders that the section `data` names, by key: all arguments called `path`."""
+    """Return the files and folders in the section `data`, by key: all arguments called `path`."""
     return {key: value for key, value in data.items() if key.split(".")[-1] == "path" and isinstance(value, str)}
 
 
 def experiment_parser() -> LightningArgumentParser:
-    """Return a parser of what makes a model and its data, without the trainer."""
+    """Return a parser for model and data, without the trainer."""
     parser = LightningArgumentParser(exit_on_error=False)
     add_seed(parser)
     parser.add_lightning_class_args(LightningModule, "model", subclass_mode=True)

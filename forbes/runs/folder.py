@@ -1,4 +1,4 @@
-"""Run folders: everything that one training leaves, in one place that no two processes share."""
+"""Run folders: all files of one training, in a folder locked by its process."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -17,26 +17,26 @@ __all__ = ["RunFolder", "experiment_name", "read_config", "read_metrics"]
 
 
 class RunFolder:
-    """Where the files of a run are.
+    """Paths of the files of a run.
 
-    ``runs/<experiment>/<time>-<seed>/``::
+    `runs/<experiment>/<time>-<seed>/`::
 
-        config.yaml        the whole configuration, defaults included
-        provenance.json    what was run, when, by which versions, on what data: one entry for each start
-        metrics.jsonl      one JSON object a line: {"update": n, "epoch": e, name: value, ...}
-        checkpoints/       last.ckpt; previous.ckpt, which is read where the last one is damaged; best.ckpt by the
-                           validation bound or an agent's return
-        failure.pt         after a divergence: what repeats the update that is not finite (`forbes replay`)
+        config.yaml        the complete configuration, including defaults
+        provenance.json    command, time, versions and data: one entry per start
+        metrics.jsonl      one JSON object per line: {"update": n, "epoch": e, name: value, ...}
+        checkpoints/       last.ckpt; previous.ckpt, used if the last one is damaged; best.ckpt by the validation bound
+                           or an agent's return
+        failure.pt         after a divergence: the data to repeat the update that is not finite (`forbes replay`)
         figures/
-        evaluation.json    and evaluation.npz, what `forbes evaluate` has measured
-        evaluation-best/   the same of another checkpoint, here checkpoints/best.ckpt
-        .lock              held by the process that trains here; .evaluation.lock by one that writes evaluation.json
+        evaluation.json    and evaluation.npz, results of `forbes evaluate`
+        evaluation-best/   the same for another checkpoint, here checkpoints/best.ckpt
+        .lock              locked by the process that trains here; .evaluation.lock while evaluation.json is written
 
-    In config.yaml the `path` of the data is absolute, so that a run can be resumed and measured from any folder. The
+    In config.yaml the `path` of the data is absolute, so that a run can be resumed and evaluated from any folder. The
     run folder itself may be moved, copied or read-only.
 
     Args:
-        path: the folder; it need not exist yet. Or one of its checkpoints, `RUN/checkpoints/best.ckpt`, to read it
+        path: run folder, which need not exist yet; or one of its checkpoints, e.g. `RUN/checkpoints/best.ckpt`, to use
             instead of the last one.
     """
 
@@ -60,7 +60,7 @@ class RunFolder:
 
     @classmethod
     def new(cls, experiment: str, started: str, seed: int) -> "RunFolder":
-        """Make a folder of its own for a run of an experiment that starts now."""
+        """Create a new folder for a run of an experiment that starts now."""
         first = path = Path("runs") / experiment / f"{started}-{seed}"
         number = 1
         while True:
@@ -74,20 +74,20 @@ class RunFolder:
 
     @classmethod
     def trained(cls, path: Path | str) -> "RunFolder":
-        """Open the folder of a run that has a checkpoint.
+        """Return the folder of a run that has a checkpoint.
 
         Raises:
-            ForbesError: when there is no such run, it was stopped before its first checkpoint, or a folder in it is a
-                symbolic link, through which results would be written elsewhere.
+            ForbesError: if the run does not exist or has no checkpoint yet, or if a folder in it is a symbolic link,
+                through which results would be written elsewhere.
         """
         run = cls(path)
         if not run.path.is_dir():
-            raise ForbesError(f"{run}: no such run folder. `forbes fit` makes one, under runs/")
+            raise ForbesError(f"{run}: no such run folder. `forbes fit` creates one in runs/")
         if not run.config.is_file():
-            raise ForbesError(f"{run}: not a run folder, config.yaml is missing. Name a folder that `forbes fit` made")
+            raise ForbesError(f"{run}: not a run folder, config.yaml is missing. Name a folder written by `forbes fit`")
         if run.results != run.path and not run.checkpoint.is_file():
-            there = sorted(path.name for path in run.checkpoint.parent.glob("*.ckpt"))
-            raise ForbesError(f"{run.checkpoint}: no such checkpoint. There are {', '.join(there) or 'none'}")
+            existing = sorted(path.name for path in run.checkpoint.parent.glob("*.ckpt"))
+            raise ForbesError(f"{run.checkpoint}: no such checkpoint. There are {', '.join(existing) or 'none'}")
         if not run.checkpoint.is_file():
             raise ForbesError(f"{run}: has no checkpoint yet. Train it: forbes fit --config {run.config}")
         require_no_links(path for path in run.path.iterdir() if path.is_dir())
@@ -95,7 +95,7 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep every other process from training in this folder; the system frees it when the process dies."""
+        """Lock this folder against training by other processes. The system unlocks it when the process dies."""
         with locked(self.path, "trains here. Choose another --run_dir"):
             remove_halves(self.path, self.config.name, self.provenance.name, self.failure.name)
             remove_halves(self.checkpoint.parent, "*.ckpt")
@@ -103,7 +103,7 @@ class RunFolder:
 
 
 def experiment_name(configs: Sequence[str]) -> str:
-    """Name an experiment after its first configuration: configs/strokes/forbes.yaml is strokes/forbes."""
+    """Return the name of an experiment by its first configuration: configs/strokes/forbes.yaml is strokes/forbes."""
     if not configs:
         return "unnamed"
     parts = Path(configs[0]).with_suffix("").parts
@@ -113,10 +113,10 @@ def experiment_name(configs: Sequence[str]) -> str:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read the config.yaml of a run, with the public name of each class, which an older run has in full.
+    """Read the config.yaml of a run, with the current public name of each class.
 
     Raises:
-        ForbesError: where it is not what `forbes fit` writes.
+        ForbesError: if it is not a file written by `forbes fit`.
     """
     remedy = "Restore it, or name another run"
     config = read_yaml(path, remedy)
@@ -127,9 +127,9 @@ def read_config(path: Path) -> dict[str, Any]:
         if not isinstance(section, dict) or not isinstance(section.get("class_path"), str):
             raise ForbesError(f"{path}: its section {name} has no class_path, expected the name of a class. {remedy}")
         if not isinstance(section.setdefault("init_args", {}), dict):
-            raise ForbesError(f"{path}: {name}.init_args is no mapping, expected arguments by name. {remedy}")
-    named: dict[str, Any] = _with_public_names(config)
-    return named
+            raise ForbesError(f"{path}: {name}.init_args is not a mapping, expected arguments by name. {remedy}")
+    renamed: dict[str, Any] = _with_public_names(config)
+    return renamed
 
 
 def _with_public_names(section: Any) -> Any:
@@ -143,18 +143,18 @@ def _with_public_names(section: Any) -> Any:
 
 
 def read_metrics(run: Path | str) -> pd.DataFrame:
-    """Read a run's metrics: a row for each update, a column for each name, the last value where there are several.
+    """Read a run's metrics: one row per update, one column per name, with the last of several values.
 
-    A run that was killed and resumed repeats the updates after its checkpoint; the lines of the first life are dropped.
+    A run that was killed and resumed repeats the updates after its checkpoint. The lines before the kill are dropped.
 
     Raises:
-        ForbesError: when the file is missing or a line is not what `forbes fit` writes.
+        ForbesError: if the file is missing or has an invalid line.
     """
     path = RunFolder(run).metrics
     if not path.is_file():
-        raise ForbesError(f"{path}: no such file. Name a run folder that `forbes fit` made")
+        raise ForbesError(f"{path}: no such file. Name a run folder written by `forbes fit`")
     rows: dict[int, dict[str, Any]] = {}
-    *lines, _ = path.read_bytes().split(b"\n")  # a kill cut the last line short; or it is being written
+    *lines, _ = path.read_bytes().split(b"\n")  # the last line may be truncated by a kill, or still being written
     for number, line in enumerate(lines, start=1):
         try:
             record = json.loads(line)
@@ -173,7 +173,7 @@ def read_metrics(run: Path | str) -> pd.DataFrame:
 
 
 def _is_line_of_metrics(record: Any) -> bool:
-    """Tell whether this is what `JsonLinesLogger` writes: an update, and numbers."""
+    """Return whether this is a line of `JsonLinesLogger`: an update, and numbers."""
     if not isinstance(record, dict) or type(record.get("update")) is not int:
         return False
     return all(is_number(value) for name, value in record.items() if name != "start")

@@ -1,4 +1,4 @@
-"""Arguments of a model as plain values, so that a checkpoint can hold them and nothing has to be unpickled."""
+"""Arguments of a model as plain values, so that a checkpoint can store them without pickling."""
 
 import argparse
 import inspect
@@ -18,20 +18,20 @@ __all__ = ["build_arguments", "plain_arguments"]
 
 
 def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return arguments as config.yaml has them: a class with its options is its `class_path` and `init_args`."""
+    """Return arguments as in config.yaml: a class with options becomes its `class_path` and `init_args`."""
     return {name: _plain(value) for name, value in arguments.items()}
 
 
 def build_arguments(kind: type, plain: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return plain arguments of a class as its constructor takes them: the inverse of `plain_arguments`.
+    """Return the constructor's arguments for plain arguments: the inverse of `plain_arguments`.
 
     Args:
-        kind: the class.
-        plain: some of its arguments by name.
-        where: the file they are from, for an error.
+        kind: class to construct.
+        plain: some of its arguments by name, as plain values.
+        where: file of the arguments, for error messages.
 
     Raises:
-        ForbesError: for an argument that the class does not have, or a class that a configuration may not name.
+        ForbesError: for an argument that the class does not have, or a class that a configuration may not use.
     """
     allow_modules()
     others = {*inspect.signature(kind).parameters} - {*plain}
@@ -48,16 +48,16 @@ def build_arguments(kind: type, plain: Mapping[str, Any], where: str) -> dict[st
 
 
 def _plain(value: Any) -> Any:
-    """Return one argument: numbers and words as they are, tuples as lists, all else by the name of its class.
+    """Return one argument: numbers and strings unchanged, tuples as lists, anything else by the name of its class.
 
-    What cannot be built by its name, such as a lambda, is refused by `build_arguments`, and has to be given again.
+    Values without an importable name, such as a lambda, are refused by `build_arguments`, and must be passed again.
     """
     if value is None or isinstance(value, bool | str):
         return value
-    if isinstance(value, Real):  # of numpy, too
+    if isinstance(value, Real):  # includes numpy's
         return int(value) if isinstance(value, Integral) else float(value)
     if isinstance(value, tuple | list):
-        return [_plain(each) for each in value]
+        return [_plain(item) for item in value]
     if isinstance(value, partial):
         return {"class_path": _path(value.func), "init_args": plain_arguments(value.keywords)}
     if isinstance(value, Likelihood):
@@ -68,5 +68,5 @@ def _plain(value: Any) -> Any:
 
 
 def _path(kind: Any) -> str:
-    """Return where a class or a function can be imported from."""
+    """Return the import path of a class or a function."""
     return f"{kind.__module__}.{kind.__qualname__}"

@@ -1,4 +1,4 @@
-"""Loggers of a configuration: they write into the run folder, unless the configuration names another folder."""
+"""Loggers of a configuration, which write to the run folder unless the configuration names another folder."""
 
 import inspect
 from functools import partial
@@ -12,13 +12,13 @@ from lightning.pytorch.loggers import Logger
 __all__ = ["ParserOfRuns", "open_logger"]
 
 _FOLDERS = ("save_dir", "root_dir")
-"""What loggers call the argument that names their folder."""
+"""Names of the argument for a logger's folder."""
 
 
 class ParserOfRuns(LightningArgumentParser):
-    """A parser for runs whose folder is made after their configuration is known.
+    """A parser for runs whose folder is created after parsing.
 
-    A logger may be given without a folder, even where its class requires one. Instantiated it is a partial, for
+    A logger may be given without a folder, even if its class requires one. It is instantiated as a partial, for
     `open_logger`.
     """
 
@@ -34,7 +34,7 @@ class ParserOfRuns(LightningArgumentParser):
         super().validate(completed, *args, **kwargs)
 
     def instantiate(self, namespace: Namespace, *args: Any, **kwargs: Any) -> Namespace:
-        """Instantiate everything but the loggers."""
+        """Instantiate everything except the loggers."""
         built: Namespace = super().instantiate(namespace, *args, **kwargs, instantiators=[(_later, Logger, True)])
         return built
 
@@ -44,11 +44,11 @@ def _later(kind: type[Logger], **arguments: Any) -> "partial[Logger]":
 
 
 def open_logger(logger: "partial[Logger]", run: Path) -> Logger:
-    """Build a logger.
+    """Instantiate a logger.
 
     Args:
-        logger: its class with the arguments of the configuration.
-        run: the run folder. It replaces a folder that is not given. A default is relative to it, as `./mlruns` is.
+        logger: class of the logger with the arguments of the configuration.
+        run: run folder, used if the logger has no folder. A default such as `./mlruns` is relative to it.
     """
     parameters = inspect.signature(logger.func).parameters
     for name in _FOLDERS:

@@ -1,4 +1,4 @@
-"""The logger of every run: an append-only file of JSON lines that survives kills and resumes."""
+"""The logger of every run: an append-only file of JSON lines, robust to kills and resumes."""
 
 import json
 from argparse import Namespace
@@ -17,11 +17,11 @@ __all__ = ["JsonLinesLogger", "MarkStart"]
 class JsonLinesLogger(Logger):
     """Appends {"update": n, "epoch": e, name: value, ...} for each set of metrics; `read_metrics` reads them.
 
-    `update` counts the optimiser's updates before the values were measured. A line is on its way to the disk when
-    `log_metrics` returns, so a killed process loses none that belongs to its checkpoint.
+    `update` is the number of optimiser updates before the values were measured. A line has been handed to the system
+    when `log_metrics` returns, so a killed process loses no line before its checkpoint.
 
     Args:
-        path: of the file, `metrics.jsonl` in a run folder.
+        path: file to append to, `metrics.jsonl` in a run folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,31 +31,31 @@ class JsonLinesLogger(Logger):
 
     @property
     def name(self) -> str:
-        """Nothing: Lightning puts checkpoints under `save_dir / name / version`."""
+        """Empty, since Lightning's folder is `save_dir / name / version`."""
         return ""
 
     @property
     def version(self) -> str:
-        """Nothing, likewise."""
+        """Empty, since Lightning's folder is `save_dir / name / version`."""
         return ""
 
     @property
     def save_dir(self) -> str:
-        """The run folder; Lightning gives it to callbacks as `trainer.log_dir`."""
+        """The run folder, available to callbacks as `trainer.log_dir`."""
         return str(self.path.parent)
 
     @rank_zero_only
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
-        """Append one line; Lightning's `step` is the index of the last update."""
+        """Append one line. Lightning's `step` is the index of the last update."""
         self._append({"update": (-1 if step is None else step) + 1, **metrics})
 
     @rank_zero_only
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
-        """Do nothing: they are in config.yaml."""
+        """Do nothing, since the hyperparameters are in config.yaml."""
 
     @rank_zero_only
     def mark_start(self, update: int) -> None:
-        """Note that a process goes on from here; lines of later updates above this one were lost with another."""
+        """Append a mark that a process starts at this update: earlier lines of later updates are obsolete."""
         self._append({"update": update, "start": True})
 
     def _append(self, record: dict[str, Any]) -> None:
@@ -66,10 +66,10 @@ class JsonLinesLogger(Logger):
 
 
 class MarkStart(Callback):
-    """Tells every `JsonLinesLogger` at which update a training starts or goes on."""
+    """Marks in every `JsonLinesLogger` the update at which a training starts or resumes."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Mark it before the first update."""
+        """Write the mark before the first update."""
         for logger in trainer.loggers:
             if isinstance(logger, JsonLinesLogger):
                 logger.mark_start(trainer.global_step)

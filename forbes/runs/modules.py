@@ -1,4 +1,4 @@
-"""Modules of a run: the model and the data of its configuration, with the weights of a checkpoint."""
+"""Build the model and the data of a run's configuration, and load the weights of a checkpoint."""
 
 import argparse
 from collections.abc import Mapping
@@ -29,24 +29,24 @@ Module = TypeVar("Module", bound=LightningModule)
 
 
 class LoadedRun(NamedTuple, Generic[Module]):
-    """What was read of a run, all at one time: a training may go on, and write others over its files."""
+    """A loaded run, consistent even if a training replaces the files afterwards."""
 
     module: Module
-    """On the CPU and in evaluation mode."""
+    """Module on the CPU in evaluation mode."""
     data: SequenceDataModule
     config: dict[str, Any]
-    """config.yaml."""
+    """Content of config.yaml."""
     checkpoint: str
-    """SHA-256 of the checkpoint that the weights were read from, for the record of what is measured."""
+    """SHA-256 of the checkpoint from which the weights were loaded, for records of evaluations."""
 
 
 def load_module(checkpoint: Path, kind: type[Module], arguments: Mapping[str, Any]) -> Module:
-    """Load a module from a checkpoint, on the CPU; see `WorldModel.load_from_checkpoint`.
+    """Load a module from a checkpoint, on the CPU. `WorldModel.load_from_checkpoint` calls this.
 
     Args:
-        checkpoint: in a run folder, `RUN/checkpoints/NAME.ckpt`, or elsewhere, of a plain `Trainer`.
+        checkpoint: checkpoint in a run folder, `RUN/checkpoints/NAME.ckpt`, or one of a plain `Trainer`.
         kind: class of the module.
-        arguments: of its constructor, in the place of those it was trained with.
+        arguments: constructor arguments that replace those used in training.
     """
     if RunFolder(checkpoint).config.is_file():
         changes = {f"model.init_args.{name}": value for name, value in arguments.items()}
@@ -67,16 +67,16 @@ def load_module(checkpoint: Path, kind: type[Module], arguments: Mapping[str, An
 
 
 def open_module(run: Path | str, kind: type[Module], other: str, changes: Mapping[str, Any] = {}) -> LoadedRun[Module]:
-    """Load the module of a run, on the CPU and in evaluation mode.
+    """Load the module of a run, on the CPU in evaluation mode.
 
     Args:
-        run: its folder, for the last checkpoint, or a checkpoint in it.
+        run: run folder, for its last checkpoint, or a checkpoint in it.
         kind: class of the module.
-        other: command for runs of another class, for an error.
-        changes: as for `build_run`.
+        other: command for runs of another class, for the error message.
+        changes: values that replace those of config.yaml, by key.
 
     Raises:
-        ForbesError: where the module is of another class, or its weights do not fit.
+        ForbesError: if the module is of another class, or its weights do not fit.
     """
     folder = RunFolder.trained(run)
     checkpoint = open_checkpoint(folder.checkpoint)
@@ -84,7 +84,7 @@ def open_module(run: Path | str, kind: type[Module], other: str, changes: Mappin
     module, data, config = build_run(folder, changes)
     if not isinstance(module, kind):
         found = type(module).__name__
-        raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Measure it with: {other} {run}")
+        raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Use instead: {other} {run}")
     check_weights(module, state, str(folder.checkpoint))
     module.load_state_dict(state)
     return LoadedRun(module.eval(), data, config, checkpoint.sha256)
@@ -93,14 +93,14 @@ def open_module(run: Path | str, kind: type[Module], other: str, changes: Mappin
 def build_run(
     folder: RunFolder, changes: Mapping[str, Any] = {}
 ) -> tuple[LightningModule, SequenceDataModule, dict[str, Any]]:
-    """Build the module and the data of a run's config.yaml, and return them with it; the weights are untrained.
+    """Build the module, with untrained weights, and the data of a run, and return them with the configuration.
 
     Args:
-        folder: of the run.
-        changes: values that replace those of config.yaml, by their keys, such as `model.init_args.learning_rate`.
+        folder: run folder.
+        changes: values that replace those of config.yaml, by key, e.g. `model.init_args.learning_rate`.
 
     Raises:
-        ForbesError: where the configuration cannot be built, or its data are not there.
+        ForbesError: if the configuration cannot be instantiated, or its data do not exist.
     """
     config = read_config(folder.config)
     for key, value in {**changed_defaults(config), **changes}.items():
@@ -120,21 +120,23 @@ def build_run(
     for key, path in data_paths(parsed["data"]).items():
         if not Path(path).exists():
             name = "data." + key.replace("init_args.", "")
-            raise ForbesError(f"{folder.config}: {name} is {path}, which is not there. Set it to where the data are")
+            raise ForbesError(
+                f"{folder.config}: {name} is {path}, which does not exist. Set it to the path of the data"
+            )
     with building(str(folder.config)):
         built = parser.instantiate(parsed, instantiators=[(partial(_recalled, folder.path), Experience, True)])
     return built.model, built.data, config
 
 
 def _recalled(run: Path, kind: type[Experience], **arguments: Any) -> Experience:
-    """Build the source of an agent's run, with the shapes that the run has stored: no environment need start."""
+    """Build the source of an agent's run with the stored shapes, so that no environment has to be started."""
     source = kind(**arguments)
     source.recall(run / "episodes")
     return source
 
 
 def _put(config: dict[str, Any], key: str, value: Any) -> None:
-    """Set `a.b.c` in nested sections."""
+    """Set the value of a dotted key `a.b.c` in nested sections."""
     *sections, last = key.split(".")
     for name in sections:
         config = config.setdefault(name, {})
@@ -145,30 +147,30 @@ def weights_of(content: Any, name: str) -> dict[str, Tensor]:
     """Return the weights in a checkpoint.
 
     Raises:
-        ForbesError: where it is not the checkpoint of a training.
+        ForbesError: if it is not the checkpoint of a training.
     """
     state = content.get("state_dict") if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(values, Tensor) for values in state.values()):
         raise ForbesError(f"{name}: has no state_dict of tensors, expected that of a training. Take another one")
     if not isinstance(content.get("global_step"), int):
-        raise ForbesError(f"{name}: does not say its global_step, expected the checkpoint of a training")
+        raise ForbesError(f"{name}: has no global_step, expected the checkpoint of a training")
     return state
 
 
 def check_weights(model: nn.Module, state: Mapping[str, Tensor], name: str) -> None:
-    """Compare the tensors of a checkpoint with those of a model.
+    """Check that the tensors of a checkpoint fit a model.
 
     Raises:
-        ForbesError: naming the first tensor that only one of them has, or that has two shapes.
+        ForbesError: for the first tensor that is missing in one of them, or has another shape.
     """
-    own = model.state_dict()
-    for key in (*own, *state):
+    expected = model.state_dict()
+    for key in (*expected, *state):
         if key not in state:
             problem = f"it has no {key}, which the configured model has: another belief family"
-        elif key not in own:
+        elif key not in expected:
             problem = f"its {key} is not in the configured model: another belief family"
-        elif own[key].shape != state[key].shape:
-            shapes = f"{tuple(state[key].shape)}, that of the configured model {tuple(own[key].shape)}"
+        elif expected[key].shape != state[key].shape:
+            shapes = f"{tuple(state[key].shape)}, that of the configured model {tuple(expected[key].shape)}"
             problem = f"its {key} is {shapes}: other sizes, or observations or actions of another shape"
         else:
             continue

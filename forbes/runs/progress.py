@@ -1,4 +1,4 @@
-"""Progress of a training: a bar on a terminal, one plain line an epoch in a log file."""
+"""Progress of a training: a bar on a terminal, one plain line per epoch elsewhere."""
 
 import math
 import sys
@@ -15,22 +15,22 @@ _STEPS = ("env_steps", "agent_steps")
 
 
 def progress() -> ProgressBar:
-    """Choose by where the output goes."""
+    """Return the progress bar for the current output."""
     return TerminalProgress() if sys.stdout.isatty() else PlainProgress()
 
 
 class TerminalProgress(RichProgressBar):
-    """Lightning's bar, showing the objectives."""
+    """Lightning's progress bar with the objectives."""
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
-        """Return what the bar shows at its right."""
+        """Return the metrics on the right of the bar."""
         return dict(_objectives(trainer, pl_module))
 
 
 class PlainProgress(ProgressBar):
-    """Prints one line an epoch.
+    """Prints one line per epoch: updates, time, speed, objectives and the remaining time.
 
-    Updates, time, speed, objectives and the time left::
+    Example::
 
         epoch 2/20  update 1000/10000  0:01:40  10.0 updates/s  train/elbo[bernoulli,S=1] -240.1  left 0:15:00
     """
@@ -40,11 +40,11 @@ class PlainProgress(ProgressBar):
         self._enabled = True
 
     def disable(self) -> None:
-        """Print nothing from now on; Lightning calls it on every process but the first."""
+        """Stop printing. Lightning calls this on every process except the first."""
         self._enabled = False
 
     def enable(self) -> None:
-        """Print again."""
+        """Resume printing."""
         self._enabled = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -52,7 +52,7 @@ class PlainProgress(ProgressBar):
         self._start, self._first = time.monotonic(), trainer.global_step
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Print the line; the epoch's validation is done."""
+        """Print the line, after the validation of the epoch."""
         if not self._enabled:
             return
         elapsed = time.monotonic() - self._start
@@ -73,8 +73,8 @@ class PlainProgress(ProgressBar):
 
 
 def _objectives(trainer: Trainer, module: LightningModule) -> dict[str, str]:
-    """Return the newest bound, or loss in nats per step, of each split; what an agent has seen, earns and foresees."""
-    objective = getattr(module, "objective_name", "loss")  # a module of somebody else's may have none
+    """Return the latest objective of each split, and an agent's steps, returns and reward predictions, as text."""
+    objective = getattr(module, "objective_name", "loss")  # third-party modules may have none
     return {
         name: _shown(name, float(value))
         for name, value in trainer.callback_metrics.items()

@@ -1,4 +1,4 @@
-"""Provenance: what was run, when, on which machine, by which versions and on what data."""
+"""Provenance of a run: command, time, machine, versions and data."""
 
 import json
 import os
@@ -20,6 +20,7 @@ from lightning.pytorch.cli import LightningArgumentParser, SaveConfigCallback
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 import forbes
+from forbes.data.datamodule import datamodule_of
 from forbes.errors import ForbesError
 from forbes.files import replace_file
 from forbes.reading import read_json
@@ -27,23 +28,23 @@ from forbes.runs.configuration import allowed_modules
 from forbes.runs.folder import RunFolder
 from forbes.runs.stop import StopOnSignal
 
-__all__ = ["RecordRun", "command_line", "commit", "read_provenance"]
+__all__ = ["RecordRun", "command_line", "commit", "origin", "read_provenance"]
 
 PACKAGES = ("torch", "lightning", "jsonargparse", "numpy", "dm-control", "mujoco", "gymnasium")
-"""What may change the numbers of a run; the last three are optional."""
+"""Packages that may change the results of a run; the last three are optional."""
 
 
 class RecordRun(SaveConfigCallback):
-    """Writes `config.yaml` and `provenance.json`, an entry for each start; completes the entry at the end.
+    """Writes `config.yaml` and `provenance.json` with one entry per start, which is completed at the end.
 
-    An entry without `exit_status` belongs to a process that was killed, or still runs.
+    An entry without `exit_status` belongs to a process that was killed or is still running.
 
     Args:
-        parser: of the command line.
-        config: the whole configuration.
-        run: where the files go.
-        stop: knows which signal has ended the training.
-        arguments: of the command line.
+        parser: parser of the command line.
+        config: complete configuration.
+        run: run folder to write to.
+        stop: callback that knows which signal ended the training.
+        arguments: arguments of the command line.
     """
 
     def __init__(
@@ -68,13 +69,13 @@ class RecordRun(SaveConfigCallback):
         self._write()
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Note success."""
+        """Record success."""
         self._end(0)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Note failure, or the signal that has ended the training."""
+        """Record the failure, or the signal that ended the training."""
         failed = exception.exit_status if isinstance(exception, ForbesError) else 1
-        with suppress(ForbesError):  # on a full disk; why the training has failed is worth more than its record
+        with suppress(ForbesError):  # on a full disk the original error is more important than its record
             stopped = isinstance(exception, SIGTERMException) or self.stop.received is not None
             self._end(self.stop.exit_status if stopped else failed)
 
@@ -92,17 +93,17 @@ def read_provenance(path: Path) -> list[dict[str, Any]]:
     """Read provenance.json.
 
     Raises:
-        ForbesError: where it is not a list of starts.
+        ForbesError: if it is not a list of entries.
     """
-    remedy = "Move it out of the run folder, and give the command again"
+    remedy = "Move it out of the run folder, and repeat the command"
     entries = read_json(path, remedy)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ForbesError(f"{path}: expected a list with an entry for each start. {remedy}")
+        raise ForbesError(f"{path}: expected a list with one entry per start. {remedy}")
     return entries
 
 
 def _describe(arguments: Sequence[str]) -> dict[str, Any]:
-    """Return what does not depend on the configuration."""
+    """Return command, time, commit, versions and machine."""
     return {
         "command": command_line(*arguments),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -128,16 +129,22 @@ def _versions() -> dict[str, str]:
 
 def _describe_data(trainer: Trainer) -> dict[str, Any]:
     """Return the hash of the data."""
-    return {"data_sha256": trainer.datamodule.source.sha256()}  # type: ignore[attr-defined]
+    return {"data_sha256": datamodule_of(trainer).source.sha256()}
 
 
 def command_line(*arguments: str) -> str:
-    """Return the command line to repeat a command, with the modules that this process was allowed to use."""
+    """Return the command line to repeat a command, with the `--allow-module` flags of this process."""
     return shlex.join(["forbes", *allowed_modules(), *arguments])
 
 
+def origin(command: str, seed: int) -> dict[str, Any]:
+    """Return command, commit, random seed and date, for the record of a result."""
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"command": command, "commit": commit(), "seed": seed, "date": date}
+
+
 def commit() -> str | None:
-    """Return the commit of the checkout this runs from, +dirty with changed files; None where git knows none."""
+    """Return the commit of this checkout, with +dirty if files are changed; None outside a git checkout."""
     root = Path(forbes.__file__).parents[1]
     if not (root / ".git").exists():
         return None

@@ -1,4 +1,4 @@
-"""A clean stop: Ctrl-C and SIGTERM end a training where it can go on, with a checkpoint to go on from."""
+"""A clean stop: on Ctrl-C and SIGTERM a training ends with a checkpoint from which it can resume."""
 
 import os
 import signal
@@ -9,21 +9,22 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from forbes.data import Experience
+from forbes.data.datamodule import datamodule_of
 from forbes.runs.folder import RunFolder
 
 __all__ = ["StopOnSignal"]
 
 
 class StopOnSignal(Callback):
-    """Stops a training at the first SIGINT or SIGTERM as soon as its state is whole; at the second at once.
+    """Stops a training at the first SIGINT or SIGTERM as soon as its state is consistent, at the second immediately.
 
-    That is after the update at hand; for an agent, whose epoch begins with an episode that a resumed one would lack,
-    after the epoch.
+    The state is consistent after the current update. For an agent it is consistent after the epoch, since the episode
+    at the start of the epoch would be missing otherwise.
 
-    Left alone, Lightning breaks off in the middle of an update at Ctrl-C, and saves nothing at either signal.
+    Without this callback, Lightning stops in the middle of an update on Ctrl-C, and saves nothing on either signal.
 
     Args:
-        run: where the state is saved.
+        run: run folder to save to.
     """
 
     def __init__(self, run: RunFolder) -> None:
@@ -32,24 +33,24 @@ class StopOnSignal(Callback):
 
     @property
     def exit_status(self) -> int:
-        """What a shell expects of a process that a signal has ended: 130 for Ctrl-C, 143 for SIGTERM.
+        """Exit status of a process ended by a signal: 130 for Ctrl-C, 143 for SIGTERM.
 
-        One that came before the training began was received by Lightning, which knows SIGTERM only.
+        A signal before the start of the training is received by Lightning, which handles SIGTERM only.
         """
         return 128 + (self.received or signal.SIGTERM)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take the place of Lightning's handler, which it puts back itself after the training."""
+        """Replace Lightning's signal handlers, which Lightning restores after the training."""
         self._end_loop = signal.getsignal(signal.SIGTERM)
-        self._whole_epochs = isinstance(trainer.datamodule.source, Experience)  # type: ignore[attr-defined]
+        self._whole_epochs = isinstance(datamodule_of(trainer).source, Experience)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._receive)
-        if trainer.received_sigterm:  # since the start; Lightning would end the loop within an agent's epoch
+        if trainer.received_sigterm:  # before this point; Lightning would end the loop within an agent's epoch
             cast(Any, trainer)._signal_connector.received_sigterm = False
             self._receive(signal.SIGTERM, None)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
-        """End the loop after this update, unless a validation follows, which must not be left half done."""
+        """End the loop after this update, unless a validation follows, which must be completed."""
         updates = (batch_idx + 1) % trainer.accumulate_grad_batches == 0  # a checkpoint has no half-summed gradients
         if updates and not trainer.is_last_batch and not self._whole_epochs:
             self._end()
@@ -59,7 +60,7 @@ class StopOnSignal(Callback):
         self._end()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Save, when the loop has ended because of a signal."""
+        """Save a checkpoint if a signal ended the loop."""
         if isinstance(exception, SIGTERMException):
             trainer.save_checkpoint(self.run.checkpoint)
 
@@ -67,8 +68,8 @@ class StopOnSignal(Callback):
         if self.received is not None:
             raise SystemExit(128 + number)
         self.received = number
-        if self._whole_epochs:  # which may take minutes; print could be what was interrupted
-            os.write(2, b"\nstopping after this epoch; once more to stop at once, and lose it\n")
+        if self._whole_epochs:  # may take minutes; os.write, since the signal may have interrupted a print
+            os.write(2, b"\nstopping after this epoch; once more to stop immediately, and lose it\n")
 
     def _end(self) -> None:
         if self.received is not None and callable(self._end_loop):

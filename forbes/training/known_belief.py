@@ -12,7 +12,7 @@ from forbes.errors import ForbesError
 from forbes.models.elbo import elbo_loss
 from forbes.models.known_model import KnownModel, Standardizer
 from forbes.performance.precision import full_precision
-from forbes.pomdps import CategoricalBelief, Process
+from forbes.pomdps import FiniteBelief, Process
 from forbes.pomdps.base import require_positive
 from forbes.pomdps.distributions import PointMass
 from forbes.seeding import generator
@@ -146,7 +146,7 @@ def has_transition_density(process: Process) -> bool:
 def _require_density(process: Process, objective: Objective) -> None:
     """Refuse finite states, and the ELBO where p(s_t | s_{t-1}, a) is no density."""
     name = type(process).__name__
-    if isinstance(process.initial(torch.zeros(1)), CategoricalBelief):
+    if isinstance(process.initial(torch.zeros(1)), FiniteBelief):
         raise ForbesError(f"KnownBelief: the states of {name} are finite, expected a density. Train a WorldModel on it")
     if objective == "elbo" and not has_transition_density(process):
         raise ForbesError(

@@ -95,7 +95,7 @@ def test_refuses_a_balance_outside_0_to_1(balance):
         CategoricalBelief(12, CONTEXT, 4, kl_balance=balance)
 
 
-def test_there_is_no_closed_form_between_other_families_or_other_classes():
+def test_other_families_or_classes_have_no_closed_form():
     context = contexts(2)
 
     assert head().kl(context, GaussianBelief(12, CONTEXT).double(), context) is None

@@ -93,7 +93,7 @@ def test_one_context_serves_many_points():
         torch.testing.assert_close(y[:, row], flow(x[:, row], context[row].expand(7, -1))[0])
 
 
-def test_a_coupling_keeps_one_part_and_scales_the_other_by_at_most_e_squared():
+def test_a_coupling_scales_one_part_by_at_most_e_squared():
     flow = random_flow(dim=5, layers=1, scale=100.0)
     x, context = normal(1000, 5), normal(1000, CONTEXT, seed=1)
     step = torch.tensor([0.0, 0, 1, 1, 1], dtype=torch.float64)  # along the part that is transformed
@@ -106,7 +106,7 @@ def test_a_coupling_keeps_one_part_and_scales_the_other_by_at_most_e_squared():
     assert log_slope.max() > 1.9, "the weights were too small to reach the bound"
 
 
-def test_lu_linear_has_the_determinant_and_the_inverse_of_its_matrix():
+def test_lu_linear_gives_the_determinant_and_the_inverse():
     torch.manual_seed(0)
     mixing = randomised(LULinear(6))
 

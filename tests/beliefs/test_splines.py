@@ -66,7 +66,7 @@ def test_agrees_with_zuko_given_equal_bins(zuko, bins):
 
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(dim=st.integers(1, 5), layers=st.integers(1, 4), bins=st.integers(2, 9), seed=st.integers(0, 10**6))
-def test_inverse_undoes_the_flow_and_both_give_the_log_determinant_of_the_jacobian(dim, layers, bins, seed):
+def test_inverse_undoes_the_flow_and_both_give_the_log_det(dim, layers, bins, seed):
     flow = random_belief(dim, layers, bins, seed, scale=0.15).flow
     x, context = 2 * normal(dim, seed=seed), normal(CONTEXT, seed=1)
 
@@ -121,7 +121,7 @@ def test_the_slope_is_bounded_inside_the_bins_too(scale):
     assert scale < 100 or (least < LOG_SLOPES[0] + 1 and most > LOG_SLOPES[1] - 1)
 
 
-def test_stays_increasing_bounded_and_invertible_in_float32_with_the_wildest_knots():
+def test_is_monotone_bounded_and_invertible_at_extreme_knots():
     """Nothing divides by zero, no root is imaginary; rounding is magnified by the inverse of the least slope only."""
     table = knot_table(wildest(2000).float())
     x = torch.linspace(-BOUND, BOUND, 2000)
@@ -138,7 +138,7 @@ def test_stays_increasing_bounded_and_invertible_in_float32_with_the_wildest_kno
     assert (ladder >= -steps).all(), "not increasing"
 
 
-def test_a_last_knot_that_rounding_left_below_the_edge_of_the_box_does_no_harm():
+def test_a_last_knot_rounded_below_the_box_edge_is_harmless():
     """The sum of 32 float32 bins is 5 to a few 1e-6; a last bin this steep magnifies that a million times."""
     short, flat, steep = 1e-5, [-BOUND, -BOUND, 9.99, 0.01, 1.0, 1.0], [4.99, -4.99, 0.01, 9.99, 1.0, 1.0]
     table = torch.tensor([flat, steep], dtype=torch.float64).T  # (6, 2)
@@ -163,7 +163,7 @@ def test_a_float32_flow_finds_its_way_back(dim):
 
 
 @pytest.mark.parametrize("dim", [1, 8])
-def test_a_coupling_with_weights_of_unit_gain_keeps_its_inverse_in_float32(dim):
+def test_a_unit_gain_coupling_keeps_its_inverse_in_float32(dim):
     """Where heights are shares of their own, half of the box is lost here, and a density is wrong by 400 nats."""
     torch.manual_seed(0)
     flow = FlowBelief(dim, 64, layers=1, coupling="spline").flow

@@ -14,8 +14,8 @@ from small_agents import fit, write_image_config
 
 from forbes.callbacks import EpisodeVideo, ImaginedFutures, OpenLoopPanel, ReturnCurve
 from forbes.callbacks.picture import shown_sequences
-from forbes.evaluation.predictions import open_loop
-from forbes.figures.imagination import imagined_futures
+from forbes.evaluation.predictions import open_loop_frames
+from forbes.figures.imagination import draw_futures
 from forbes.figures.returns import published_curves, return_curve
 from forbes.figures.video import gif
 from forbes.runs.checkpoint import read_checkpoint
@@ -80,7 +80,7 @@ def test_a_training_with_pictures_is_bitwise_the_one_without(run, tmp_path):
     assert {path.name for path in (run / "figures").iterdir()} == names
 
 
-def test_the_frames_seen_are_reconstructed_and_later_observations_change_nothing(trained):
+def test_seen_frames_are_reconstructed_and_later_ones_unused(trained):
     module, data = trained
     model = module.model
     batch = shown_sequences(data, 2, module)
@@ -89,7 +89,7 @@ def test_the_frames_seen_are_reconstructed_and_later_observations_change_nothing
     outputs = []
     for each in (batch, other, batch._replace(action=-batch.action)):
         torch.manual_seed(3)
-        outputs.append(open_loop(model, each, context=2))
+        outputs.append(open_loop_frames(model, each, context=2))
     torch.manual_seed(3)
     with torch.no_grad():
         filtered = model.filter(model.embed(batch.observation[:, :2]), batch.action[:, :2])
@@ -101,22 +101,22 @@ def test_the_frames_seen_are_reconstructed_and_later_observations_change_nothing
     assert not torch.equal(outputs[2][:, 2:], outputs[0][:, 2:])  # but the actions do
 
 
-def test_the_panel_shows_truth_model_and_half_their_difference_around_grey(trained):
+def test_the_panel_shows_truth_model_and_halved_error(trained):
     module, data = trained
     batch = shown_sequences(data, 2, module)
 
     figure = draw(PANEL, module, data)
 
     assert [axes.get_title() for axes in figure.axes] == [
-        "seen, and reconstructed",
-        "imagined under the true actions",
+        "observed and reconstructed",
+        "imagined for the true actions",
         "",
         "",
     ]
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["truth", "model", "error"]
     assert [label.get_text() for label in figure.axes[3].get_xticklabels()] == ["t=3", "t=5"]
     torch.manual_seed(0)
-    expected = open_loop(module.model, batch, 2)
+    expected = open_loop_frames(module.model, batch, 2)
     for number in range(2):
         for axes, times in zip(figure.axes[2 * number :], ([0, 1], [2, 4]), strict=False):
             truth, model, error = cells(axes, 2)  # each (2, H, W, 3)
@@ -157,7 +157,7 @@ def test_a_future_stands_at_its_own_step():
     """A frame whose grey is its time, counted from 1, out of 20."""
     time = torch.arange(1, 21).view(20, 1, 1, 1).expand(20, 3, 8, 8) / 20
 
-    figure = imagined_futures(time, time[5:].expand(2, -1, -1, -1, -1), context=5, columns=4)
+    figure = draw_futures(time, time[5:].expand(2, -1, -1, -1, -1), context=5, columns=4)
 
     labels = [int(label.get_text()[2:]) for axes in figure.axes[2:] for label in axes.get_xticklabels()]
     assert labels == [2, 4, 5, 6, 11, 15, 20]
@@ -198,7 +198,7 @@ def test_the_curve_has_every_return_at_its_env_steps(run, trained):
     assert figure.axes[0].get_title() == "Slide"
 
 
-def test_published_curves_are_drawn_as_mean_and_range_over_their_seeds(tmp_path):
+def test_published_curves_are_drawn_as_mean_and_range_of_seeds(tmp_path):
     curves = [
         ("dmc_cup_catch", 0, [0, 10, 20], [0, 1, 2]),
         ("dmc_cup_catch", 1, [0, 10], [4, 5]),
@@ -218,7 +218,7 @@ def test_published_curves_are_drawn_as_mean_and_range_over_their_seeds(tmp_path)
     assert figure.axes[0].get_xlim()[1] == pytest.approx(1.02 * 15)
 
 
-def test_fetched_curves_are_drawn_without_being_asked_for_where_they_have_the_task(tmp_path, monkeypatch):
+def test_fetched_curves_are_drawn_by_default_for_their_task(tmp_path, monkeypatch):
     monkeypatch.setenv("FORBES_DATA", str(tmp_path))
     assert published_curves(None, "walker_walk") == {}  # not fetched
 
@@ -244,9 +244,9 @@ def test_a_curve_without_any_return_yet_is_empty():
         ("ImaginedFutures, init_args: {samples: 0}", "ImaginedFutures: samples is 0, expected at least 1"),
         ("ImaginedFutures, init_args: {context: 9}", "ImaginedFutures: context is 9, expected less than the length 5"),
         ("EpisodeVideo, init_args: {every: 0}", "EpisodeVideo: every is 0, expected at least 1"),
-        ("ReturnCurve, init_args: {reference: absent.json}", "absent.json: no such file of curves"),
+        ("ReturnCurve, init_args: {reference: absent.json}", "absent.json: no such file"),
         ("ReturnCurve, init_args: {reference: empty.json}", "empty.json: truncated or not JSON"),
-        ("ReturnCurve, init_args: {reference: other.json}", "other.json: has no curve of Slide, but of dmc_walk"),
+        ("ReturnCurve, init_args: {reference: other.json}", "other.json: has no curve for Slide, only for dmc_walk"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_before_the_training(callback, message, in_tmp_path, capsys):
@@ -269,7 +269,7 @@ def test_vectors_are_no_pictures(callback, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("callback", [EpisodeVideo(), ReturnCurve()])
-def test_a_world_model_alone_has_no_returns_and_no_episodes_of_its_own(callback, tiny_run):
+def test_a_world_model_alone_has_no_returns_and_no_episodes(callback, tiny_run):
     module, data = load_run(tiny_run)
     with pytest.raises(Exception, match="found a WorldModel on Strokes, expected an agent on Experience"):
         callback.on_fit_start(SimpleNamespace(datamodule=data), module)

@@ -85,17 +85,17 @@ def test_every_family_and_likelihood_is_drawn(arguments, tiny_config, callbacks,
     assert all(is_picture(tmp_path / "figures" / name) for name in PICTURES)
 
 
-def test_a_model_without_a_state_has_no_belief_to_plot_and_all_the_rest(tiny_config, callbacks, tmp_path, capsys):
+def test_a_model_without_a_state_has_all_but_the_belief_plot(tiny_config, callbacks, tmp_path, capsys):
     flags = ["--config", str(tiny_config), "--model.model", "VectorModel", "--model.state_dim", "0"]
     assert main(["fit", *flags, "--config", str(callbacks), "--run_dir", str(tmp_path / "refused")]) == 2
-    assert "BeliefPlot: VectorModel has no state to plot. Leave this callback out" in capsys.readouterr().err
+    assert "BeliefPlot: VectorModel has no state to plot. Remove this callback" in capsys.readouterr().err
     assert not RunFolder(tmp_path / "refused").checkpoint.exists()
     run = tmp_path / "run"
     assert main(["fit", *flags, "--run_dir", str(run)]) == 0
 
     curves, grid = draw(ElboCurve(6), run), draw(PredictionGrid(3, 2, 3), run)
 
-    assert [axes.get_title() for axes in curves.axes] == ["log_p[bernoulli]", "loss of the roll-out"]
+    assert [axes.get_title() for axes in curves.axes] == ["log_p[bernoulli]", "rollout loss"]
     metrics = read_metrics(run)
     for axes, name in zip(curves.axes, ["log_p[bernoulli]", "overshoot"], strict=True):
         assert axes.lines[1].get_ydata() == pytest.approx(metrics[f"val/{name}"].dropna())
@@ -172,7 +172,7 @@ def test_the_kl_of_each_step_leaves_padding_out_and_adds_up(tiny_run):
     torch.testing.assert_close(error[t], kl[mask[:, t], t].std() / math.sqrt(mask[:, t].sum()))
 
 
-def test_a_prediction_grid_shows_each_digit_with_what_was_seen_and_the_samples(tiny_run):
+def test_a_prediction_grid_shows_truth_seen_frames_and_samples(tiny_run):
     figure = draw(PredictionGrid(digits=4, samples=2, context=3), tiny_run)
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == ["truth", "seen", "sampled completions, t = 6", "sampled completions, t = 9"]
@@ -181,7 +181,7 @@ def test_a_prediction_grid_shows_each_digit_with_what_was_seen_and_the_samples(t
     assert rows == {4 * 30 + 2}
 
 
-def test_a_context_that_leaves_nothing_to_predict_is_refused_before_training(tiny_config, tmp_path, capsys):
+def test_a_context_that_leaves_nothing_to_predict_is_refused(tiny_config, tmp_path, capsys):
     config = tmp_path / "callbacks.yaml"
     config.write_text("trainer: {callbacks: [{class_path: PredictionGrid, init_args: {context: 6}}]}")
     run = str(tmp_path / "run")
@@ -229,7 +229,7 @@ def test_the_legend_of_beliefs_names_each_colour_that_is_drawn(tiny_run):
     assert not [one for one, other in pairwise(boxes) if one.overlaps(other)]
 
 
-def test_a_belief_of_more_dimensions_is_projected_on_the_priors_principal_plane():
+def test_a_belief_is_projected_on_the_priors_principal_plane():
     torch.manual_seed(0)
     spread = torch.tensor([0.1, 3.0, 1.0], dtype=torch.float64)
     prior = torch.randn(4000, 3, dtype=torch.float64) * spread
@@ -244,7 +244,7 @@ def test_a_belief_of_more_dimensions_is_projected_on_the_priors_principal_plane(
     torch.testing.assert_close(shift, torch.tensor([1.0, 0.0]).double(), rtol=0, atol=0.05)
 
 
-def test_a_kernel_density_is_the_mean_of_its_kernels_and_integrates_to_one():
+def test_a_kernel_density_is_a_mean_and_integrates_to_one():
     torch.manual_seed(0)
     samples = torch.randn(64, 2, dtype=torch.float64) * torch.tensor([1.0, 0.2])
     x, y = torch.linspace(-8, 8, 400).double(), torch.linspace(-3, 3, 400).double()
@@ -257,7 +257,7 @@ def test_a_kernel_density_is_the_mean_of_its_kernels_and_integrates_to_one():
     assert torch.trapezoid(torch.trapezoid(density, x), y).item() == pytest.approx(1, abs=1e-6)
 
 
-def test_parameters_of_the_parts_add_up_and_are_printed_and_logged(tiny_config, callbacks, tmp_path, capsys):
+def test_parameter_counts_add_up_and_are_printed_and_logged(tiny_config, callbacks, tmp_path, capsys):
     configs = ["--config", str(tiny_config), "--config", str(callbacks)]
     main(["fit", *configs, "--run_dir", str(tmp_path), "--trainer.max_epochs", "1"])
     module, _ = load_run(tmp_path)

@@ -31,14 +31,14 @@ def run(tmp_path_factory):
     return folder / "run"
 
 
-def test_there_is_one_episode_before_each_epoch_and_the_seed_episodes_before_the_first(run):
+def test_each_epoch_adds_one_episode_to_the_seed_episodes(run):
     records = EpisodeStore(run / "episodes").records.values()
 
     assert [record.policy for record in records] == ["random"] * 2 + ["ImaginationActorCritic"] * 2
     assert len({record.seed for record in records}) == 4
 
 
-def test_trainings_of_different_seeds_live_through_different_episodes(run, tmp_path):
+def test_trainings_of_different_seeds_see_different_episodes(run, tmp_path):
     assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run", "--seed_everything", "1") == 0
 
     stores = [EpisodeStore(folder / "episodes") for folder in (run, tmp_path / "run")]
@@ -65,13 +65,13 @@ def test_the_returns_are_those_of_the_episodes(run):
     assert metrics["return/acting"].notna().sum() == 2  # after epochs 2 and 3, the last
 
 
-def test_what_the_model_foresees_is_that_of_the_episodes_that_measure_the_agent(run):
+def test_reward_prediction_is_scored_on_the_measured_episodes(run):
     """By the weights of the end, which are those of the last measurement."""
     module, data = load_run(run)
     played = [play_measured(module, data.source.environment, "evaluation", 0, number) for number in range(2)]
     data.source.close()
 
-    told = [predict_rewards(module, one, derive_seed(0, "foresight", k), "", (5,))[0] for k, one in enumerate(played)]
+    told = [predict_rewards(module, one, derive_seed(0, "foresight", k), "", (5,))[5] for k, one in enumerate(played)]
     share = r2_score(told, [torch.from_numpy(one.reward[1:]).double() for one in played])
 
     logged = read_metrics(run)["reward_explained/5"].dropna()
@@ -111,7 +111,7 @@ def test_every_agent_trains(kind, tmp_path):
     assert torch.isfinite(torch.tensor(read_metrics(tmp_path / "run")["train/reward"].dropna().values)).all()
 
 
-def test_an_agent_of_deepmind_control_trains_and_lives_through_the_same_whole_episodes_again(tmp_path):
+def test_an_agent_of_deepmind_control_trains_reproducibly(tmp_path):
     """A thousand frames of the physics an episode, eight an action; in processes that start anew."""
     options = "{pixels: false, action_repeat: 8}"
     task = ("--data.source.task", "cartpole_balance", "--data.source.options", options)
@@ -128,7 +128,7 @@ def test_an_agent_of_deepmind_control_trains_and_lives_through_the_same_whole_ep
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_an_agent_plays_discrete_actions_where_the_environment_has_them(tmp_path):
+def test_an_agent_plays_discrete_actions_of_its_environment(tmp_path):
     """The tiger's door is opened or not, at random and by the agent; and what it plays is what it learns from."""
     config = write_config(tmp_path)
     task = ("--data.source.task", "tiger", "--data.source.options", "{}")
@@ -149,9 +149,9 @@ def test_a_planner_says_that_it_has_no_discrete_actions(tmp_path, capsys):
     assert "actions are discrete, expected vectors. Use ImaginationActorCritic" in capsys.readouterr().err
 
 
-def test_says_where_episodes_end_and_the_agent_imagines_that_none_does(tmp_path):
+def test_warns_if_episodes_end_but_the_agent_predicts_no_end(tmp_path):
     parrot = ("--config", write_config(tmp_path), "--data.source.options", "{steps: 8, ends: true}")
-    with pytest.warns(UserWarning, match="Parrot: an episode has ended by itself.*--model.continuation true"):
+    with pytest.warns(UserWarning, match="Parrot: an episode terminated.*--model.continuation true"):
         assert fit(*parrot, "--run_dir", tmp_path / "blind") == 0
 
     assert fit(*parrot, "--model.continuation", "true", "--run_dir", tmp_path / "run") == 0
@@ -167,7 +167,7 @@ def test_the_progress_counts_both_kinds_of_steps_beside_updates(tmp_path, capsys
     assert [line.split("update ")[1].split()[0] for line in lines] == ["4/12", "8/12", "12/12"]
 
 
-def test_a_start_that_left_no_checkpoint_lends_another_only_the_episodes_it_would_play(run, tmp_path, monkeypatch):
+def test_a_restart_reuses_only_the_episodes_it_would_play(run, tmp_path, monkeypatch):
     """Cut off in its first epoch, then begun anew in the same folder: under its seed, then under another."""
     config = write_config(tmp_path)
 
@@ -189,7 +189,7 @@ def test_a_start_that_left_no_checkpoint_lends_another_only_the_episodes_it_woul
 
 
 @pytest.mark.parametrize(("task", "what"), [("tiger", "observation"), ("mountain_hike", "action")])
-def test_an_environment_of_other_shapes_than_the_checkpoints_is_refused(run, tmp_path, capsys, task, what):
+def test_shapes_unlike_those_of_the_checkpoint_are_refused(run, tmp_path, capsys, task, what):
     """The parrot's observations are 2 numbers and its actions 1; the hike's actions are 2."""
     other = ("--data.source.task", task, "--data.source.options", "{}")
 
@@ -202,7 +202,7 @@ def test_an_environment_of_other_shapes_than_the_checkpoints_is_refused(run, tmp
 
 
 @pytest.mark.parametrize("trouble", ["raises", "rewards_nan", "sees_nan", "dies"])
-def test_an_environment_that_fails_for_good_ends_the_training_and_loses_nothing(tmp_path, capsys, trouble):
+def test_a_failing_environment_ends_training_and_loses_nothing(tmp_path, capsys, trouble):
     """In the fourth episode it learns from, after two that measured it; then it is well, and the run goes on."""
     options = f"{{trouble: {trouble}, ledger: {tmp_path / 'ledger'}, healthy: 5}}"
     task = ("--data.source.task", "Weary", "--data.source.options", options)
@@ -210,13 +210,13 @@ def test_an_environment_that_fails_for_good_ends_the_training_and_loses_nothing(
     assert fit("--config", write_config(tmp_path), *task, "--run_dir", tmp_path / "run") == 2
 
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "so broke episode 3 3 times, nothing of it is stored. Mend the environment" in error
+    assert "episode 3 failed 3 times and was not stored. Fix the environment" in error
     assert list(EpisodeStore(tmp_path / "run" / "episodes").records) == [0, 1, 2]
     assert fit("--resume", tmp_path / "run") == 0
     assert list(EpisodeStore(tmp_path / "run" / "episodes").records) == [0, 1, 2, 3]
 
 
-def test_an_environment_that_hangs_ends_the_training_after_its_time(tmp_path, capsys):
+def test_a_hanging_environment_ends_training_after_a_timeout(tmp_path, capsys):
     hangs = ("--data.source.task", "Hanging", "--data.source.options", "{}", "--data.source.timeout", 1)
 
     assert fit("--config", write_config(tmp_path), *hangs, "--run_dir", tmp_path / "run") == 2
@@ -229,7 +229,7 @@ def test_an_environment_that_hangs_ends_the_training_after_its_time(tmp_path, ca
 
 
 @pytest.mark.parametrize("overlap", ["", ", overlap: true"])
-def test_an_agent_in_an_environment_that_never_ends_is_given_episodes_all_the_same(tmp_path, overlap, capsys):
+def test_an_agent_gets_episodes_from_an_endless_environment(tmp_path, overlap, capsys):
     config = write_config(tmp_path)
     config.write_text(config.read_text().replace("seed_episodes: 2", f"seed_episodes: 2{overlap}"))
     endless = ("--data.source.task", "Endless", "--data.source.options", "{}", "--data.source.time_limit")
@@ -252,13 +252,13 @@ def test_a_disk_that_is_full_ends_the_training_and_loses_nothing(run, tmp_path, 
         patch.setattr(os, "fsync", full)
         assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run") == 2
 
-    sentence = "000003.npz: cannot be written (No space left on device). Make room, or choose another place"
+    sentence = "000003.npz: cannot be written (No space left on device). Free some space, or choose another folder"
     assert capsys.readouterr().err.splitlines()[-1].endswith(sentence)
     assert fit("--resume", tmp_path / "run") == 0
     pd.testing.assert_frame_equal(read_metrics(tmp_path / "run"), read_metrics(run), check_exact=True)
 
 
-def test_an_agent_keeps_as_many_episodes_as_its_capacity_holds_and_counts_all(run, tmp_path, monkeypatch):
+def test_an_agent_keeps_episodes_up_to_capacity_but_counts_all(run, tmp_path, monkeypatch):
     """Two of the parrot's, of 8 steps, and the two before for both checkpoints; killed late, it goes on the same."""
     fit_it = ("--config", write_config(tmp_path), "--data.source.capacity", 16, "--run_dir")
 
@@ -286,7 +286,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("update", [4, 6, 10])
-def test_a_killed_run_goes_on_to_the_same_numbers_and_the_same_episodes(run, tmp_path, monkeypatch, update):
+def test_a_killed_run_resumes_to_the_same_numbers_and_episodes(run, tmp_path, monkeypatch, update):
     """Killed after the first update of an epoch or in its midst: later episodes are set aside and played anew."""
 
     def kill(self, loss):
@@ -348,7 +348,7 @@ def test_a_resumed_run_learns_at_the_rates_it_is_given(run, tmp_path):
     assert len(read_metrics(other)) == 20
 
 
-def test_overlapped_episodes_are_one_epoch_older_and_resume_to_the_same_numbers(run, tmp_path, monkeypatch):
+def test_overlapped_episodes_lag_one_epoch_and_resume_exactly(run, tmp_path, monkeypatch):
     """The first epoch's agent plays the third episode, as without; from then on it is always one epoch behind."""
 
     def kill(self, loss):
@@ -376,9 +376,7 @@ def test_overlapped_episodes_are_one_epoch_older_and_resume_to_the_same_numbers(
 
 @pytest.mark.parametrize("overlap", ["", ", overlap: true"], ids=["in turns", "overlap"])
 @pytest.mark.parametrize("update", [0, 5, 7])
-def test_a_signal_ends_the_training_with_the_epoch_and_nothing_is_missing(
-    tmp_path, monkeypatch, capfd, overlap, update
-):
+def test_a_signal_ends_training_after_an_epoch_losing_nothing(tmp_path, monkeypatch, capfd, overlap, update):
     """At the first update, in the midst of the second epoch, and at the last of it; resumed, nothing is missing."""
 
     def interrupt(self, loss):
@@ -403,7 +401,7 @@ def test_a_signal_ends_the_training_with_the_epoch_and_nothing_is_missing(
     torch.testing.assert_close(state, expected, rtol=0, atol=0)
 
 
-def test_a_signal_before_the_training_begins_ends_it_with_an_epoch(tmp_path, monkeypatch):
+def test_a_signal_before_training_stops_it_after_one_epoch(tmp_path, monkeypatch):
     """There Lightning's own handler receives it, which would end the loop within the epoch."""
     monkeypatch.setattr(ResumeWholeEpochs, "on_train_start", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
 
@@ -413,7 +411,7 @@ def test_a_signal_before_the_training_begins_ends_it_with_an_epoch(tmp_path, mon
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_to_the_whole_group_while_the_player_starts_loses_nothing(tmp_path, monkeypatch, number):
+def test_a_group_signal_while_the_player_starts_loses_nothing(tmp_path, monkeypatch, number):
     """The player gets it before Python has begun there; `tests/envs/test_worker.py` has the same of an environment."""
     start = EpisodeWorker._start
 

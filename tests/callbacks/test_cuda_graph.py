@@ -86,7 +86,7 @@ WITH = ("  callbacks:\n", "  callbacks:\n    - {class_path: CudaGraph}\n")
 OVERLAP = ("seed_episodes: 2,", "seed_episodes: 2, overlap: true,")
 
 
-def test_fused_functions_are_compiled_and_their_numbers_and_gradients_are_the_same(agent, monkeypatch):
+def test_fused_functions_compile_and_keep_values_and_gradients(agent, monkeypatch):
     compiled = []
 
     def compile_without_code(function):
@@ -128,7 +128,7 @@ def test_what_is_no_world_model_is_refused():
         CudaGraph().on_fit_start(None, LightningModule())
 
 
-def test_an_agent_that_plays_in_another_process_leaves_the_recording_behind(agent):
+def test_an_agent_for_another_process_drops_the_recording(agent):
     agent.recorded = lambda _: None
 
     copied = AgentPolicy.as_it_is(agent, exploring=True).agent

@@ -31,7 +31,7 @@ def diverged(tiny_run, tmp_path, capsys):
     return run, before, capsys.readouterr().err
 
 
-def test_the_last_finite_checkpoint_stays_and_one_sentence_says_what_to_do(diverged):
+def test_the_last_finite_checkpoint_stays_and_advice_is_given(diverged):
     run, before, error = diverged
 
     assert run.checkpoint.read_bytes() == before
@@ -72,7 +72,7 @@ def test_replay_names_the_first_tensor_that_is_not_finite(diverged, capsys):
     assert main(["replay", str(run.failure)]) == 0
 
     said = capsys.readouterr().out
-    assert said.startswith(f"{run.failure}: update 12, computed again on cpu: the first tensor that is not finite is ")
+    assert said.startswith(f"{run.failure}: update 12, recomputed on cpu: the first tensor that is not finite is ")
     name, kind = re.search(r"is the output of ([\w.]+) \((\w+)\): \d+ of \d+ values, shape \(", said).groups()
     module, _ = load_run(run.path)
     assert type(part := module.get_submodule(name)).__name__ == kind
@@ -111,7 +111,7 @@ def test_replay_says_so_where_the_update_is_finite_now(tiny_config, tmp_path, mo
 
     assert main(["replay", str(run.failure)]) == 2
 
-    assert "update 4, computed again on cpu, is finite; it was not on cpu" in capsys.readouterr().err
+    assert "update 4, recomputed on cpu, is finite; it was not on cpu" in capsys.readouterr().err
 
 
 def test_replay_repeats_noise_batches_and_weight_of_the_kl(tiny_config, tmp_path, monkeypatch):
@@ -153,7 +153,7 @@ def test_replay_of_no_file_is_one_sentence(tiny_run, capsys):
     [
         ({"update": None}, "its update is NoneType, expected the failure.pt of a run that diverged"),
         ({"batches": [{}]}, "one of its batches lacks a field"),
-        ({"batches": []}, "it has not a number for each batch"),
+        ({"batches": []}, "it does not have one number per batch"),
         ({"state_dict": {}}, "it has no model."),
     ],
 )
@@ -181,7 +181,7 @@ def diverging_above(monkeypatch, rate, at=12):
     monkeypatch.setattr(WorldModel, "loss", unless_slow)
 
 
-def test_a_lower_rate_goes_on_from_the_checkpoint_and_is_recorded(tiny_run, tmp_path, monkeypatch, capsys):
+def test_training_resumes_at_a_lower_rate_that_is_recorded(tiny_run, tmp_path, monkeypatch, capsys):
     """At 1 and 0.5 the third epoch diverges, at 0.25 it does not."""
     run = RunFolder(shutil.copytree(tiny_run, tmp_path / "run"))
     diverging_above(monkeypatch, 0.25)
@@ -190,7 +190,7 @@ def test_a_lower_rate_goes_on_from_the_checkpoint_and_is_recorded(tiny_run, tmp_
     assert main(["fit", "--resume", str(run), *flags, *LOWER_RATE]) == 0
 
     said = capsys.readouterr().err
-    assert [f"goes on from update 10 with learning_rate {rate}" in said for rate in (0.5, 0.25)] == [True, True]
+    assert [f"continues from update 10 with learning_rate {rate}" in said for rate in (0.5, 0.25)] == [True, True]
     lines = [json.loads(line) for line in run.metrics.read_text().splitlines()]
     noted = [line for line in lines if "divergence/update" in line]
     assert noted == [{"update": 10, "divergence/update": 13, "divergence/learning_rate": rate} for rate in (0.5, 0.25)]
@@ -257,7 +257,7 @@ def test_a_held_optimiser_changes_nothing_any_more(broken):
     assert optimizer.state[weight]["step"] == 2
 
 
-def test_a_gradient_that_is_not_finite_stops_a_training_whose_loss_is(tiny_config, tmp_path, monkeypatch, capsys):
+def test_a_nonfinite_gradient_of_a_finite_loss_stops_training(tiny_config, tmp_path, monkeypatch, capsys):
     broken_loss(monkeypatch, at=3)
     run = tmp_path / "run"
 

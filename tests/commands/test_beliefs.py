@@ -68,7 +68,7 @@ def test_a_record_names_the_checkpoint_that_was_measured(run, overwritten):
     assert {entry["checkpoint"] for entry in record(run).values()} == {read}
 
 
-def test_prints_and_records_the_errors_of_the_run_beside_the_best_gaussian(run, capsys):
+def test_prints_and_records_errors_next_to_the_best_gaussian(run, capsys):
     assert beliefs(run, "--sequences", "12") == 0
 
     module, data, *_ = load_known_belief(run)
@@ -105,7 +105,7 @@ def test_a_run_that_cannot_be_written_to_asks_for_another_folder(run, monkeypatc
     assert "cannot be written to. Let the results go elsewhere: --output DIR" in error_of(capsys, "beliefs", run)
 
 
-def test_the_same_seed_gives_the_same_numbers_and_the_first_ten_do_not_need_the_others(run):
+def test_a_seed_fixes_the_numbers_and_ten_can_be_scored_alone(run):
     curves = []
     for flags in (["--sequences", "10"], ["--sequences", "10"], ["--sequences", "10", "--seed", "1"]):
         assert beliefs(run, *flags) == 0
@@ -139,13 +139,13 @@ def test_what_cannot_be_measured_is_one_sentence(run, tiny_run, tmp_path, capsys
     for arguments, sentence in [
         (
             ["beliefs", tiny_run],
-            f"{tiny_run}: a run of WorldModel, expected one of KnownBelief. Measure it with: forbes",
+            f"{tiny_run}: a run of WorldModel, expected one of KnownBelief. Use instead: forbes",
         ),
         (
             ["evaluate", run],
-            f"{run}: a run of KnownBelief, expected one of WorldModel. Measure it with: forbes beliefs",
+            f"{run}: a run of KnownBelief, expected one of WorldModel. Use instead: forbes beliefs",
         ),
-        (["beliefs", run], f"--sequences 200: the test split of {run} has 12, expected 2 to that"),
+        (["beliefs", run], f"--sequences 200: the test split of {run} has 12, expected 2 to 12"),
         (["beliefs", run, "--sequences", "1"], "--sequences 1: "),
         (["beliefs", run, other, *few], f"{other}: its data are Simulated("),
         (
@@ -168,7 +168,7 @@ def test_a_belief_that_is_not_finite_is_named(run, capsys):
     assert f"{run}: the state_nll_regret of sequence 0 is nan" in sentence
 
 
-def test_an_infinite_reverse_kl_is_reported_as_a_share_of_sequences(tmp_path, capsys):
+def test_an_infinite_reverse_kl_is_reported_as_a_share(tmp_path, capsys):
     """A Gaussian reaches beyond an exact belief of bounded support: infinite is the answer, not a diverged training."""
     allow = ["--allow-module", "bounded_process"]
     run = fit(tmp_path, "{class_path: bounded_process.Box}", *allow)

@@ -70,7 +70,7 @@ def test_a_model_that_has_diverged_is_named(run, tmp_path, capsys):
     assert f"forbes: {folder}: " in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_particles_are_ranked_and_a_model_without_a_state_is_refused(tmp_path, capsys):
+def test_particles_are_ranked_and_a_stateless_model_is_refused(tmp_path, capsys):
     numbers = ["--sequences", "60", "--samples", "19", "--time", "3", "-o", str(tmp_path / "figures")]
     particle = fit(tmp_path / "particle", "--model.model", "ParticleModel", "--model.model.particles", "4")
     vector = fit(tmp_path / "vector", "--model.model", "VectorModel", "--model.state_dim", "0")

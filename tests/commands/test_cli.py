@@ -101,7 +101,7 @@ def test_the_examples_of_its_help_can_be_run(example, monkeypatch, capsys):
     assert "class_path: forbes.WorldModel" in capsys.readouterr().out
 
 
-def test_what_its_help_says_people_change_has_the_values_of_the_first_example(monkeypatch, capsys):
+def test_flags_named_in_the_help_have_the_examples_values(monkeypatch, capsys):
     monkeypatch.chdir(CONFIGS.parent)
     flags = [f"{name}={value}" for name, value in CHANGED if value != "TASK"]
     printed = []
@@ -155,7 +155,7 @@ def test_misspelt_arguments_of_a_class_are_named(tiny_config, tmp_path, capsys):
 
     sentence = error_of(capsys, "fit", "--config", str(config))
 
-    assert sentence == f"{config}: model.encoder: MLPEncoder: expected init_args beside class_path, found int_args"
+    assert sentence == f"{config}: model.encoder: MLPEncoder: expected init_args next to class_path, found int_args"
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_misspelt_arguments_of_a_class_are_named(tiny_config, tmp_path, capsys):
         (["--batch_size", "1"], "batch_size: the configuration has no such option, did you mean data.batch_size?"),
         (["--points_per_step", "2"], "did you mean data.source.points_per_step?"),
         (["--exploration", "0"], "did you mean model.exploration?"),
-        (["mine.yaml"], "mine.yaml: a configuration needs its flag. Say: --config mine.yaml"),
+        (["mine.yaml"], "mine.yaml: a configuration needs its flag. Write: --config mine.yaml"),
         (
             ["--trainer.logger", "TensorBoardLogger", "--trainer.logger.savedir", "logs"],
             "trainer.logger.savedir: TensorBoardLogger has no such option, did you mean save_dir?",
@@ -204,7 +204,7 @@ def test_misspelt_arguments_of_a_class_are_named(tiny_config, tmp_path, capsys):
         (["--run_dir", "/proc/run"], "/proc/run: no such file or directory"),
         (["--resume", "a", "--run_dir", "b"], "not allowed with argument"),
         (["--allow-module", "no_such_module"], "--allow-module no_such_module: No module named 'no_such_module'"),
-        (["--allow-module"], "--allow-module: no name follows"),
+        (["--allow-module"], "--allow-module: the name is missing"),
     ],
 )
 def test_a_wrong_flag_is_one_sentence(flags, expected, tiny_config, in_tmp_path, capsys):
@@ -258,7 +258,7 @@ def test_debug_shows_the_traceback(in_tmp_path):
         main(["--debug", "fit", "--resume", "absent"])
 
 
-def test_a_configuration_cannot_run_a_foreign_module_unless_allowed(tiny_config, in_tmp_path, monkeypatch, capsys):
+def test_a_configuration_runs_no_foreign_module_unless_allowed(tiny_config, in_tmp_path, monkeypatch, capsys):
     Path("stranger.py").write_text(
         "import pathlib\n"
         "from forbes.beliefs import GaussianBelief\n"
@@ -295,7 +295,7 @@ def test_a_family_of_ones_own_is_compared(tiny_config, in_tmp_path, capfd):
     assert main(recorded[1:]) == 0  # what is recorded can be run
 
 
-def test_a_run_folder_is_named_after_its_configuration_and_holds_all_of_the_run(tiny_config, in_tmp_path, capsys):
+def test_a_run_folder_is_named_by_its_config_and_holds_all(tiny_config, in_tmp_path, capsys):
     assert main(["fit", "--config", str(tiny_config), "--seed_everything", "7"]) == 0
 
     (run,) = Path("runs/tiny/forbes").iterdir()
@@ -330,9 +330,7 @@ def test_a_trained_run_is_not_trained_over(tiny_config, tiny_run, capsys):
 
     sentence = error_of(capsys, "fit", "--config", str(tiny_config), "--run_dir", str(tiny_run))
 
-    assert (
-        sentence == f"{tiny_run}: holds a trained run. Name another, or go on with it: forbes fit --resume {tiny_run}"
-    )
+    assert sentence == f"{tiny_run}: holds a trained run. Name another, or resume it: forbes fit --resume {tiny_run}"
     assert (tiny_run / "metrics.jsonl").read_bytes() == before
 
 
@@ -357,7 +355,7 @@ def test_each_start_of_a_run_is_recorded_with_its_end(tiny_config, in_tmp_path, 
     assert read_metrics("run").index.max() == 15
 
 
-def test_short_epochs_under_a_long_logging_interval_warn_of_nothing(tiny_config, in_tmp_path, capsys):
+def test_short_epochs_and_long_logging_intervals_do_not_warn(tiny_config, in_tmp_path, capsys):
     assert main(["fit", "--config", str(tiny_config), "--trainer.log_every_n_steps", "50", "--run_dir", "run"]) == 0
 
     assert "logging interval" not in capsys.readouterr().err
@@ -372,7 +370,7 @@ def test_loggers_of_the_configuration_come_beside_ours(tiny_config, in_tmp_path)
     assert read_metrics("run").index.max() == 10
 
 
-def test_a_trainer_that_is_told_to_leave_nothing_leaves_the_record_of_the_run_only(tiny_config, in_tmp_path):
+def test_without_logger_or_checkpoints_only_the_record_is_left(tiny_config, in_tmp_path):
     flags = ["--trainer.logger", "false", "--trainer.enable_checkpointing", "false", "--run_dir", "run"]
 
     assert main(["fit", "--config", str(tiny_config), *flags]) == 0

@@ -15,7 +15,7 @@ from forbes.commands.cli import main
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.metrics import score_of
 from forbes.evaluation.record import read_arrays, read_record
-from forbes.figures.comparison import differences, per_step, scores
+from forbes.figures.comparison import draw_differences, draw_per_step, draw_scores
 
 ELBO = "test/elbo[bernoulli,S=2]"
 ONE_EPOCH = ["--", "--trainer.max_epochs", "1"]
@@ -66,7 +66,7 @@ def families(compared):
     return [Family(n, {seed: str(compared / f"{n}-{seed}") for seed in range(2)}, 9) for n in ("rssm", "forbes")]
 
 
-def test_every_configuration_is_trained_under_every_seed_with_the_flags(compared):
+def test_each_config_trains_with_each_seed_and_the_flags(compared):
     for name in ("rssm", "forbes"):
         for seed in range(2):
             provenance = json.loads((compared / f"{name}-{seed}" / "provenance.json").read_text())
@@ -75,7 +75,7 @@ def test_every_configuration_is_trained_under_every_seed_with_the_flags(compared
             assert json.loads(metrics[-1])["update"] == 5  # one epoch instead of two
 
 
-def test_the_tables_hold_every_score_and_the_paired_differences_of_equal_seeds(compared):
+def test_tables_hold_every_score_and_paired_seed_differences(compared):
     table = pd.read_csv(compared / "comparison.csv")
     assert set(table["family"]) == {"rssm", "forbes"}
     assert {"elbo", "iwae", "pll", "fivo", "open_loop"} <= {name[5:].split("[")[0] for name in table["metric"]}
@@ -93,16 +93,16 @@ def test_the_pictures_are_there_and_show_the_values(compared, families):
     assert {path.name for path in compared.glob("*.png")} == {"scores.png", "per-step.png", "differences.png"}
     comparison = compare(families, [ELBO])
 
-    (panel,) = scores(comparison).axes
+    (panel,) = draw_scores(comparison).axes
     own = comparison.scores.groupby("family", sort=False)["mean"]
     bars = [line.get_xdata()[0] for line in panel.lines if len(line.get_xdata()) == 2 and line.get_marker() == "None"]
     assert bars == pytest.approx(own.mean().tolist())
     assert [text.get_text() for text in panel.get_yticklabels()] == ["rssm", "forbes"]
 
-    (panel,) = per_step(comparison).axes
+    (panel,) = draw_per_step(comparison).axes
     assert panel.lines[1].get_ydata() == pytest.approx(comparison.curves[ELBO]["forbes"])
 
-    (panel,) = differences(comparison, "rssm").axes
+    (panel,) = draw_differences(comparison, "rssm").axes
     assert panel.texts[0].get_text() == f"{comparison.differences['mean'].mean():+.2f}"
 
 
@@ -140,19 +140,19 @@ def test_a_score_that_a_family_does_not_have_is_empty(configs, vector, compared,
 
     families = [Family(n, {0: str(folder / f"{n}-0")}, 9, lacks) for n, lacks in [("rssm", []), ("vector", [ELBO])]]
     comparison = compare(families, [ELBO, pll])
-    elbo, of_pll = per_step(comparison).axes
+    elbo, of_pll = draw_per_step(comparison).axes
     assert [line.get_label() for line in elbo.lines] == ["rssm"]
     assert {line.get_label(): line.get_color() for line in of_pll.lines}["rssm"] == elbo.lines[0].get_color()
-    legend = per_step(comparison).legends[0]
+    legend = draw_per_step(comparison).legends[0]
     assert [entry.get_text() for entry in legend.get_texts()] == ["rssm", "vector"]
 
 
-def test_a_family_far_below_the_others_stands_at_the_edge_in_words_and_the_known_likelihood_is_drawn():
+def test_an_outlier_is_labelled_and_the_exact_line_is_drawn():
     means = {"a": -1.0, "b": -1.2, "c": -1.1, "far": -40.0}
     rows = [(f, "test/elbo[S=1]", v) for f, v in means.items()] + [(f, "test/log_p[exact]", -0.5) for f in means]
     table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
 
-    (panel,) = scores(Comparison(table, table, {}, {})).axes
+    (panel,) = draw_scores(Comparison(table, table, {}, {})).axes
 
     assert [text.get_text() for text in panel.texts] == ["← −40.0"]
     assert panel.get_xlim()[0] > -3
@@ -163,7 +163,7 @@ def test_a_difference_that_two_families_do_not_have_says_so():
     rows = [("a", "test/elbo[S=1]", 1.0), ("a", "test/pll[K=1]", 2.0), ("b", "test/pll[K=1]", -1.0)]
     table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
 
-    (panel,) = differences(Comparison(table, table, {}, {}), "first").axes
+    (panel,) = draw_differences(Comparison(table, table, {}, {}), "first").axes
 
     assert [text.get_text() for text in panel.texts] == ["+1.00", "+2.00", "n/a", "-1.00"]
 
@@ -229,7 +229,7 @@ def test_a_family_without_any_of_the_scores_has_a_row_of_its_own(scores, configs
     assert (folder / "per-step.png").exists()
 
 
-def test_the_degradation_is_what_the_open_loop_loses_step_by_step(compared, families):
+def test_degradation_is_what_open_loop_loses_at_each_step(compared, families):
     metrics = list(pd.read_csv(compared / "comparison.csv")["metric"].unique())
 
     comparison = compare(families, metrics)
@@ -246,7 +246,7 @@ def test_the_degradation_is_what_the_open_loop_loses_step_by_step(compared, fami
     text = markdown(comparison, families)
     assert f"`{degradation}`" in text
     assert f"| forbes | {comparison.curves[degradation]['forbes'][2]:.2f} |" in text
-    assert len(per_step(comparison).axes) == 5
+    assert len(draw_per_step(comparison).axes) == 5
 
 
 def runs_of(families, name):
@@ -268,7 +268,7 @@ def test_references_stand_below_the_table_and_in_the_picture(compared, families)
     lowest = min(names, key=means.__getitem__)
     (row,) = [line for line in text.splitlines() if line.startswith(f"| `{ELBO}` |") and "<" in line]
     assert row.count(f"< {lowest}") == 2  # hardly trained: below all of them
-    axes = scores(comparison._replace(references={ELBO: {"near": -1e3, "far": 1e9}})).axes[0]
+    axes = draw_scores(comparison._replace(references={ELBO: {"near": -1e3, "far": 1e9}})).axes[0]
     assert [text.get_text() for text in axes.texts if "near" in text.get_text() or "far" in text.get_text()] == []
 
 

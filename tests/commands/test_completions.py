@@ -67,7 +67,7 @@ def test_the_record_names_the_checkpoints_that_were_measured(runs, tmp_path, ove
     assert [run["checkpoint"] for run in found] == [overwritten[str(RunFolder(run).checkpoint)] for run in copies]
 
 
-def test_differences_are_paired_and_their_mean_is_that_of_the_scores(completed, runs):
+def test_paired_differences_average_to_the_score_difference(completed, runs):
     table = pd.read_csv(completed / "completions.csv")
     name = "test[:12]/energy[c=2,N=4,end]"
     of_metric = table[table["metric"] == name].set_index(["row", "minus"])["mean"]
@@ -99,7 +99,7 @@ def test_the_same_command_gives_the_same_numbers(completed, runs, tmp_path, caps
         (["--prefixes", "2", "6"], "--prefixes 6: the sequences of"),
         (["--samples", "1"], "--samples 1: expected at least 2"),
         (["--digits", "13"], "--sequences 13: the test split of"),
-        (["--digits", "1"], "of 1 digits 1 go on after 2 steps, expected at least 2"),
+        (["--digits", "1"], "of 1 digits 1 continue after 2 steps, expected at least 2"),
         (["--prefixes", "none"], "--prefixes"),
     ],
 )
@@ -125,7 +125,7 @@ def test_runs_that_do_not_fit_are_named(runs, tiny_config, tmp_path, capsys):
 
 def test_missing_classifiers_are_an_error(runs, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(classifiers, "classifiers_path", lambda: tmp_path / "classifiers.npz")
-    assert "classifiers.npz: there is no such file" in error_of(capsys, "completions", *runs, *NUMBERS)
+    assert "classifiers.npz: no such file" in error_of(capsys, "completions", *runs, *NUMBERS)
 
 
 def test_digits_are_drawn_from_the_most_to_the_least_ambiguous():
@@ -137,7 +137,7 @@ def test_digits_are_drawn_from_the_most_to_the_least_ambiguous():
     assert by_ambiguity(reference, 9).tolist() == [0, 2, 4, 3, 1]
 
 
-def test_a_band_with_titles_has_room_for_them_below_the_labels_of_the_one_above():
+def test_titles_of_a_band_do_not_overlap_the_labels_above():
     frames = torch.ones(2, 1, 1, 4, 4)
     bands = [[Panel("a", frames, BLUE), Bars("b", np.ones((2, 3)), BLUE)], [Panel("c", frames, BLUE)]]
 

@@ -47,15 +47,15 @@ def test_show_draws_each_digit_as_a_row(tmp_path, capsys):
 
 @pytest.mark.parametrize("index", ["10000", "-1"])
 def test_a_digit_outside_its_split_is_refused(tmp_path, index):
-    with pytest.raises(ForbesError, match=f"{index} is no digit of the split test, expected 0 to 9999"):
+    with pytest.raises(ForbesError, match=f"{index} is not in the test split, expected 0 to 9999"):
         main(["show", "strokes", f"--index={index}", "-o", str(tmp_path / "strokes.png")])
 
 
 def test_a_picture_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(ForbesError, match=r"strokes\.xyz: is no picture's name \(.*\)\. End it in \.png"):
+    with pytest.raises(ForbesError, match=r"strokes\.xyz: is not the name of an image \(.*\)\. End it in \.png"):
         main(["show", "strokes", "-o", str(tmp_path / "strokes.xyz")])
-    with pytest.raises(ForbesError, match=r"file/strokes\.png: cannot be written \(.*\)\. Choose another place"):
+    with pytest.raises(ForbesError, match=r"file/strokes\.png: cannot be written \(.*\)\. Choose another folder"):
         main(["show", "strokes", "-o", str(tmp_path / "file" / "strokes.png")])
 
 
@@ -84,10 +84,10 @@ def test_fetched_curves_are_stored_there_too(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "store" / "dreamer-curves.json").read_text() == "[]"
     assert f"{tmp_path / 'store' / 'dreamer-curves.json'}: stored" in capsys.readouterr().out
     main(["fetch", "curves"])  # nothing is downloaded again
-    assert "is there already, whole" in capsys.readouterr().out
+    assert "already stored and verified" in capsys.readouterr().out
 
 
-def test_fetch_does_not_trust_a_stored_file_that_is_not_the_papers(make_arrays, tmp_path, monkeypatch):
+def test_fetch_rejects_a_stored_file_that_is_not_the_papers(make_arrays, tmp_path, monkeypatch):
     monkeypatch.setenv("FORBES_DATA", str(tmp_path))
     save_strokes(tmp_path / "dejong-strokes.npz", {split: make_arrays([[(1, 1)]]) for split in ("train", "test")})
 

@@ -24,7 +24,7 @@ def test_a_machine_that_can_train_is_well(capsys):
     assert main(["doctor"]) == 0
 
     output = capsys.readouterr().out
-    for word in ("torch", "processors", "free disk", "configurations", "strokes, bundled"):
+    for word in ("torch", "CPUs", "free disk", "configurations", "strokes, bundled"):
         assert word in output
 
 
@@ -80,7 +80,7 @@ def test_backends_are_tried_and_a_broken_one_has_its_remedy(capsys, monkeypatch)
 
     lines = capsys.readouterr().out.splitlines()
     found = {name: next(line for line in lines if f"rendering, {name}" in line) for name in ("egl", "osmesa", "wgl")}
-    assert "llvmpipe (LLVM 15), 38 frames of 64 x 64 a second" in found["egl"]
+    assert "llvmpipe (LLVM 15), 38 frames of 64 x 64 per second" in found["egl"]
     assert "no libOSMesa" in found["osmesa"]
     assert "apt-get install libosmesa6" in found["osmesa"]
     assert "unset MUJOCO_GL" in found["wgl"]

@@ -24,7 +24,7 @@ def pictures(tmp_path_factory):
     return path
 
 
-def test_collecting_counts_both_kinds_of_steps_and_does_not_begin_again(pictures, capsys):
+def test_collecting_counts_both_steps_and_does_not_restart(pictures, capsys):
     assert main(["data", "collect", "--task", "Pictures", "--episodes", "4", "-o", str(pictures)]) == 0
 
     assert f"{pictures}: 0 episodes stored, 0 agent steps, 0 env steps" in capsys.readouterr().out
@@ -42,7 +42,7 @@ def test_info_says_what_there_is_and_draws_it(pictures, tmp_path, capsys):
         r"episodes +4, of 4 ever stored; 0 terminated",
         r"steps +16 agent steps, 16 env steps \(frames, with action repeat\)",
         r"return +4\.000 to 4\.000, mean 4\.000",
-        r"reward of a step +1\.000 to 1\.000, mean 1\.000",
+        r"reward per step +1\.000 to 1\.000, mean 1\.000",
         r"action 1 +-0\.\d+ to 0\.\d+, mean -?0\.\d+",
         r"policies +random: 4 episodes",
     ):
@@ -53,7 +53,7 @@ def test_info_says_what_there_is_and_draws_it(pictures, tmp_path, capsys):
     assert white > 0.1
 
 
-def test_an_episode_without_an_end_is_truncated_at_the_limit_that_is_given(tmp_path):
+def test_an_endless_episode_is_truncated_at_the_given_limit(tmp_path):
     collect = ["data", "collect", "--task", "Endless", "-o", str(tmp_path), "--episodes"]
     assert main([*collect, "2", "--time-limit", "7"]) == 0
 
@@ -66,7 +66,7 @@ def test_an_episode_without_an_end_is_truncated_at_the_limit_that_is_given(tmp_p
 def test_a_store_of_another_limit_of_steps_is_another_store(tmp_path, capsys):
     collect = ["collect", "--task", "Parrot", "-o", tmp_path, "--episodes"]
     assert main(["data", *map(str, collect), "1"]) == 0
-    sentence = "holds episodes whose time_limit is 100000, not 7. Choose another folder"
+    sentence = "has episodes whose time_limit is 100000, not 7. Choose another folder"
     assert sentence in error_of(capsys, "data", *collect, 2, "--time-limit", 7)
 
     index = tmp_path / "index.jsonl"  # of a version that had no limit: one that nobody reached
@@ -75,7 +75,7 @@ def test_a_store_of_another_limit_of_steps_is_another_store(tmp_path, capsys):
     assert len(EpisodeStore(tmp_path).records) == 2
 
 
-def test_an_environment_that_hangs_ends_the_command_and_leaves_nothing_half_written(tmp_path, capsys):
+def test_a_hanging_environment_ends_collecting_cleanly(tmp_path, capsys):
     collect = [
         "data",
         "collect",
@@ -93,10 +93,10 @@ def test_an_environment_that_hangs_ends_the_command_and_leaves_nothing_half_writ
 
     dropped, again, error = capsys.readouterr().err.splitlines()
     for line in (dropped, again):
-        assert line == "forbes: Echo: it hangs, no answer to step within 1 s; episode 0 is dropped and played again"
+        assert line == "forbes: Echo: it hangs, no answer to step within 1 s; episode 0 is dropped and replayed"
     assert error == (
-        "forbes: Echo: it hangs, no answer to step within 1 s; so broke episode 0 3 times, nothing of it is stored. "
-        "Mend the environment"
+        "forbes: Echo: it hangs, no answer to step within 1 s; episode 0 failed 3 times and was not stored. "
+        "Fix the environment"
     )
     assert not list((tmp_path / "store").glob("*.npz"))
 
@@ -108,14 +108,14 @@ def test_check_finds_all_whole_and_then_the_damage(pictures, tmp_path, capsys):
         if file.is_file():
             (store / file.name).write_bytes(file.read_bytes())
     assert main(["data", "check", str(store)]) == 0
-    assert f"{store}: 4 episodes read, 4 whole, 0 damaged" in capsys.readouterr().out
+    assert f"{store}: 4 episodes read, 4 intact, 0 damaged" in capsys.readouterr().out
 
     broken = store / "000002.npz"
     broken.write_bytes(broken.read_bytes().replace(b"\xff", b"\xfe", 1))
     assert main(["data", "check", str(store)]) == 1
     output = capsys.readouterr().out
     assert f"{broken}: damaged (its sha256 is not that of the index), moved to {store}/quarantine" in output
-    assert f"{store}: 4 episodes read, 3 whole, 1 damaged" in output
+    assert f"{store}: 4 episodes read, 3 intact, 1 damaged" in output
     assert main(["data", "check", str(store)]) == 0
     assert list(EpisodeStore(store).records) == [0, 1, 3]
 
@@ -131,7 +131,7 @@ def damaged(tmp_path, capsys):
     return store
 
 
-def test_a_damaged_store_is_named_by_what_reads_it_and_what_is_put_aside_is_told(damaged, capsys):
+def test_damaged_episodes_are_named_and_quarantine_is_reported(damaged, capsys):
     assert re.search(r"000000\.npz: damaged .*forbes data check", error_of(capsys, "data", "info", damaged))
     assert main(["data", "check", str(damaged)]) == 1
     capsys.readouterr()
@@ -190,7 +190,7 @@ def test_vectors_are_described_and_not_drawn(tmp_path, capsys):
         (["collect", "--task", "Picture", "-o", "x"], "Picture: no such task. Did you mean Pictures?"),
         (
             ["collect", "--task", "tiger", "--fast", "-o", "x"],
-            "tiger: its environment has no option fast. Leave it out",
+            "tiger: its environment has no option fast. Remove it",
         ),
         (["collect", "--task", "tiger", "-o", "/proc/x"], "/proc/x: no such file or directory"),
         *(
@@ -208,7 +208,7 @@ def test_what_cannot_be_is_one_sentence(arguments, sentence, in_tmp_path, capsys
     assert list(in_tmp_path.iterdir()) == []
 
 
-def test_a_misspelt_task_of_the_suite_is_suggested_from_the_process_that_knows_it(tmp_path, capsys):
+def test_a_misspelt_task_of_the_suite_gets_a_suggestion(tmp_path, capsys):
     pytest.importorskip("dm_control")
     arguments = ["collect", "--task", "walker_wlak", "--no-pixels", "-o", tmp_path / "store"]
 

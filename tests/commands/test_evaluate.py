@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import error_of
+from rich.console import Console
 from small_models import make_model
 
 from forbes.commands import tables
@@ -17,7 +18,7 @@ from forbes.commands.cli import main
 from forbes.commands.evaluate import evaluate as measure
 from forbes.errors import ForbesError
 from forbes.evaluation import scoring
-from forbes.evaluation.metrics import EvaluatedRun, pair
+from forbes.evaluation.metrics import EvaluatedRun, compare_pairs
 from forbes.evaluation.references import references
 from forbes.evaluation.runs import load_runs, split_batches
 from forbes.evaluation.scoring import PartialScores, make_scorer, score_split
@@ -123,7 +124,7 @@ def arrays_of(run):
         return dict(arrays)
 
 
-def test_records_the_mean_over_the_whole_split_and_every_sequence(runs):
+def test_records_the_mean_of_the_split_and_every_sequence(runs):
     assert evaluate(*runs, "--batch-size", "5") == 0
 
     for run in load_runs(runs):
@@ -157,7 +158,7 @@ def test_a_record_names_the_checkpoint_that_was_measured(runs, overwritten):
         assert {entry["checkpoint"] for entry in entries.values()} == {overwritten[str(run.checkpoint)]}
 
 
-def test_every_score_is_measured_by_default_and_named_with_its_numbers(runs, capsys):
+def test_all_scores_are_default_and_named_with_their_numbers(runs, capsys):
     numbers = ["--samples", "2", "--particles", "3", "--futures", "4", "--context", "2", "--digits", "5"]
     assert main(["evaluate", *runs, *numbers]) == 0
 
@@ -215,7 +216,7 @@ def test_a_score_that_a_model_does_not_have_is_left_out_and_said(runs, other_fil
     np.testing.assert_allclose(arrays_of(vector)["test[:5]/pll[bernoulli,K=4]"], log_p.numpy(), rtol=1e-6)
 
 
-def test_scores_and_numbers_that_cannot_be_are_said_in_one_sentence(other_filters, capsys):
+def test_impossible_scores_and_numbers_are_one_sentence(other_filters, capsys):
     vector, particle = other_filters
     expected = "a Vector model has no elbo or fivo score, its likelihood is exact. Ask for --scores pll or open-loop"
     assert expected in refusal(capsys, vector, "--scores", "elbo", "fivo")
@@ -251,7 +252,7 @@ PROCESSES = sorted(path.parent.name for path in (Path(__file__).parents[2] / "co
 
 
 @pytest.mark.parametrize("process", PROCESSES)
-def test_the_bounds_of_a_trained_model_stand_in_order_below_the_likelihood_of_every_process(process, tmp_path):
+def test_bounds_of_a_trained_model_lie_in_order_below_log_p(process, tmp_path):
     """Paired over sequences, each difference at least 0 within four standard errors."""
     config = Path(__file__).parents[2] / "configs" / "pomdp" / process / "rssm.yaml"
     small = ["--data.length=10", "--data.updates_per_epoch=150", "--trainer.max_epochs=1", "--model.warmup=20"]
@@ -276,7 +277,7 @@ def test_both_runs_record_the_same_paired_difference(runs, capsys):
     assert f"{mine['mean']:+.2f} ± {mine['standard_error']:.2f}" in capsys.readouterr().out
 
 
-def test_more_particles_than_memory_are_named_after_a_try_with_fewer_sequences(runs, capsys):
+def test_too_many_particles_for_memory_are_named_after_a_retry(runs, capsys):
     assert evaluate(runs[0], "--scores", "fivo", "--particles", "1000000000000", "--digits", "2") == 2
 
     error = capsys.readouterr().err.splitlines()[-1]
@@ -305,7 +306,7 @@ def test_an_interrupted_evaluation_goes_on_where_it_stopped(runs, monkeypatch):
     assert not (RunFolder(runs[0]).path / "evaluation-parts").exists()
 
 
-def test_what_an_interrupted_evaluation_left_is_not_used_for_another_checkpoint_or_seed(runs, monkeypatch):
+def test_partial_scores_serve_only_their_seed_and_checkpoint(runs, monkeypatch):
     monkeypatch.setattr(PartialScores, "remove", lambda self: None)
     evaluate(runs[0])
     first = record(runs[0])[NAME]["mean"]
@@ -344,7 +345,7 @@ def test_each_split_and_subset_keeps_its_own_entry(runs):
     assert [len(arrays_of(runs[0])[name]) for name in names] == [12, 20, 5]
 
 
-def test_the_table_names_families_and_the_metric_with_its_likelihood(runs, capsys):
+def test_the_table_names_families_metrics_and_likelihoods(runs, capsys):
     evaluate(*runs)
     out = capsys.readouterr().out
     assert all(part in out for part in ("test", "elbo", "[bernoulli,S=2]"))
@@ -375,7 +376,7 @@ def test_every_score_stands_beside_its_references(runs, capsys):
 @pytest.mark.parametrize("number", [1, 2, 6])
 @pytest.mark.parametrize("width", [80, 120, 200])
 def test_the_tables_fit_the_terminal_and_cut_no_name(runs, capsys, monkeypatch, number, width):
-    monkeypatch.setattr(tables, "_PIPE", width)
+    monkeypatch.setattr(tables, "console", lambda _: Console(width=width))
     measured = evaluated(runs, number, "elbo")
     name = "test[:1000]/open_loop_marginal[normal(0.5,scale=1),K=1000,c=15]"
     for one in measured:
@@ -383,7 +384,7 @@ def test_the_tables_fit_the_terminal_and_cut_no_name(runs, capsys, monkeypatch, 
 
     tables.print_runs(measured)
     tables.print_references(measured)
-    tables.print_pairs(pair(measured))
+    tables.print_pairs(compare_pairs(measured))
 
     lines = capsys.readouterr().out.splitlines()
     table = [line for line in lines if line[:1] in "┏┃┡│└├"]

@@ -50,7 +50,7 @@ def test_the_help_of_an_option_states_its_default(action):
         ("pixels", "--no-pixels", "default: images in DeepMind Control only"),
     ],
 )
-def test_the_help_of_collect_states_the_defaults_of_the_environments(option, flag, stated):
+def test_collect_help_states_the_environments_defaults(option, flag, stated):
     (action,) = [each.values[0] for each in OPTIONS if each.id == f"data collect {flag}"]
     suite, gymnasium = (inspect.signature(kind).parameters[option].default for kind in (DeepMindControl, Gymnasium))
 

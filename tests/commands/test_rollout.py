@@ -20,7 +20,7 @@ def run(tmp_path_factory):
     return folder / "run"
 
 
-def test_the_video_shows_the_episodes_and_the_returns_are_those_of_evaluate(run, tmp_path, capsys):
+def test_the_video_shows_the_episodes_that_evaluate_measures(run, tmp_path, capsys):
     path = tmp_path / "new" / "agent.gif"
 
     assert forbes("rollout", run, "--video", path, "--episodes", 2, "--seed", 3) == 0

@@ -119,7 +119,7 @@ def test_many_trajectories_act_on_the_belief_and_not_on_a_guess():
     assert many.belief.hidden.std(0).min() > 0  # each goes on from its own state
 
 
-def test_many_trajectories_take_the_discrete_action_that_most_of_them_choose():
+def test_many_trajectories_vote_for_the_discrete_action():
     model, _ = build()
     agent = Agent(model, greedy(votes := Upwards(discrete=True)), 0, samples=9)
 

@@ -38,7 +38,7 @@ def test_density_integrates_to_one():
     assert abs(total - 1) < 1e-3  # so the oracle is a density; ours agrees with it above
 
 
-def test_log_probability_stays_finite_where_the_action_rounds_to_one():
+def test_log_prob_is_finite_where_the_action_rounds_to_one():
     action, log_prob = TanhNormal(torch.full((1,), 40.0), torch.ones(1)).rsample()
 
     assert action == 1
@@ -99,7 +99,7 @@ def test_discrete_actions_follow_their_probabilities():
     assert ours.mode()[0].tolist() == [[0, 1, 0], [1, 0, 0]]
 
 
-def test_the_surprise_of_discrete_actions_has_the_gradient_of_their_entropy():
+def test_discrete_surprise_has_the_gradient_of_the_entropy():
     logits = torch.tensor([0.0, 1.0, -1.0], dtype=torch.float64, requires_grad=True)
     torch.manual_seed(0)
     surprise = -policies.OneHotCategorical(logits.expand(40_000, 3)).rsample()[1].mean()
@@ -124,7 +124,7 @@ def test_shapes(shape, discrete):
 
 
 @pytest.mark.parametrize("floor", [1e-4, 0.1])
-def test_the_actor_strays_as_far_as_its_floor_where_it_would_rather_not(floor):
+def test_the_actors_spread_never_falls_below_its_floor(floor):
     actor = Actor(6, 2, 32, 2, min_std=floor)
     torch.nn.init.constant_(actor.head.bias, -1000.0)
 

@@ -69,7 +69,7 @@ def test_a_batch_depends_on_seed_and_update_only():
     assert one != [module(seed=4).train_index(update).tolist() for update in range(12)]
 
 
-def test_a_pass_shows_no_sequence_twice_and_the_next_is_in_another_order():
+def test_a_pass_repeats_no_sequence_and_the_next_is_reordered():
     data, batches = module(), 23 // 5
 
     passes = [torch.cat([data.train_index(turn * batches + k) for k in range(batches)]) for turn in range(50)]
@@ -86,7 +86,7 @@ def trainer_after(batches, of_this_epoch=0, overfit_batches=0.0):
     return SimpleNamespace(fit_loop=loop, overfit_batches=overfit_batches)
 
 
-def test_an_epoch_goes_on_from_the_batches_that_the_trainer_has_taken():
+def test_an_epoch_continues_after_the_batches_already_taken():
     data = module()
     whole = [data.train_index(update).tolist() for update in range(18)]
 
@@ -187,10 +187,10 @@ class Own(Simulated):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda batch: tuple(batch), "decode gives a tuple, expected a SequenceBatch"),
+        (lambda batch: tuple(batch), "decode returns a tuple, expected a SequenceBatch"),
         (
             lambda batch: batch._replace(observation=batch.observation.double()),
-            "decode gives observation float64 (2, 3, 2), expected float32 (2, 3, 2)",
+            "decode returns observation float64 (2, 3, 2), expected float32 (2, 3, 2)",
         ),
         (
             lambda batch: batch._replace(observation=batch.observation[..., :1]),
@@ -212,7 +212,7 @@ def test_what_a_source_gives_is_checked_with_its_first_batch(change, sentence):
 
 
 @pytest.mark.parametrize("name", ["observation_shape", "action_dim"])
-def test_a_source_that_does_not_say_its_shapes_is_refused_when_it_is_given(name):
+def test_a_source_without_its_shapes_is_refused_at_once(name):
     source = Own(lambda batch: batch)
     SequenceDataModule(source)
     delattr(source, name)

@@ -27,7 +27,7 @@ def test_a_batch_holds_the_chosen_sequences_of_the_process():
     assert not batch.reward.any()
 
 
-def test_splits_and_seeds_have_sequences_of_their_own_and_the_same_each_time():
+def test_each_split_and_seed_has_its_own_fixed_sequences():
     first = {split: source().trajectories(split, 3).observation for split in ("train", "validation", "test")}
     again = source().trajectories("test", 3).observation
 

@@ -16,7 +16,7 @@ def frames(*rewards, terminated=False):
     return iter(steps).__next__
 
 
-def test_rewards_and_frames_add_up_and_the_last_observation_is_seen():
+def test_repeated_steps_add_up_and_show_the_last_observation():
     step = repeat(frames(1.0, 2.0, 4.0, 8.0), 3)
 
     assert (step.reward, step.frames, step.observation.tolist()) == (7.0, 3, [2.0, 2.0])
@@ -29,7 +29,7 @@ def test_the_end_of_an_episode_is_not_passed():
     assert (step.reward, step.frames, step.terminated) == (3.0, 2, True)
 
 
-def test_an_action_fills_its_bounds_and_keeps_its_scale_at_missing_ones():
+def test_an_action_fills_bounds_and_is_unscaled_without_them():
     low, high = np.array([0, -2, -np.inf, 1, -np.inf]), np.array([4, 2, np.inf, np.inf, -5])
 
     for action, expected in ((-1, [0, -2, -1, 1, -7]), (0, [2, 0, 0, 2, -6]), (1, [4, 2, 1, 3, -5])):
@@ -64,14 +64,14 @@ class Sound(Environment):
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("observation_shape", None, "observation_shape is None, expected (C, H, W) or (O,). Give the class one"),
+        ("observation_shape", None, "observation_shape is None, expected (C, H, W) or (O,). Set it in the class"),
         ("observation_shape", (8, 8), "observation_shape is (8, 8), expected"),
         ("observation_shape", 4, "observation_shape is 4, expected"),
-        ("action_dim", 0, "action_dim is 0, expected a whole number above 0"),
+        ("action_dim", 0, "action_dim is 0, expected an integer above 0"),
         ("action_dim", 1.5, "action_dim is 1.5, expected"),
         ("action_repeat", None, "action_repeat is None, expected"),
         ("discrete", 1, "discrete is 1, expected true or false"),
-        ("describe", dict, "describe() gives {}, expected a task among it"),
+        ("describe", dict, "describe() returns {}, expected a task"),
     ],
 )
 def test_what_an_environment_must_say_is_checked(name, value, sentence):
@@ -85,5 +85,5 @@ def test_what_an_environment_must_say_is_checked(name, value, sentence):
 
 
 def test_what_is_no_step_is_named():
-    with pytest.raises(ValueError, match="it gives a tuple, expected a Step"):
+    with pytest.raises(ValueError, match="it returns a tuple, expected a Step"):
         check_step((SEEN, 0.0), SEEN.shape)

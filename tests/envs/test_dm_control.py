@@ -42,7 +42,7 @@ def test_a_seed_is_an_episode_whatever_was_played_before(domain, name):
 
 
 @pytest.mark.parametrize("action_repeat", [1, 3])
-def test_a_step_is_so_many_of_the_suite_with_the_action_in_its_own_units(action_repeat):
+def test_a_step_repeats_a_suite_step_with_a_rescaled_action(action_repeat):
     ours = DeepMindControl("cartpole_balance", pixels=False, action_repeat=action_repeat)
     theirs = suite.load("cartpole", "balance", task_kwargs={"random": 4})
     theirs.reset()
@@ -118,11 +118,11 @@ def test_a_pole_thinner_than_a_pixel_is_in_a_fast_frame(backend, seed):
     [
         (("cartpole_swingp",), "cartpole_swingp: no such task. Did you mean cartpole_swingup"),
         (("walker_wlak",), "Did you mean walker_walk"),
-        (("qqq",), "qqq: no such task. `forbes data collect --help` says what there is"),
+        (("qqq",), "qqq: no such task. `forbes data collect --help` lists the tasks"),
         (("cartpole_swingup", False, 0), "cartpole_swingup: action_repeat is 0, expected at least 1"),
         (
             ("lqr_lqr_2_1",),
-            "lqr_lqr_2_1: its actions have no bounds that [-1, 1] could be scaled to.",
+            "lqr_lqr_2_1: its actions are unbounded, so [-1, 1] cannot be scaled to them.",
         ),
     ],
 )
@@ -145,7 +145,7 @@ class Painted:
         return self.frame
 
 
-def test_a_frame_of_one_colour_is_an_error_and_one_other_pixel_is_none():
+def test_only_a_frame_of_a_single_colour_is_an_error():
     environment = DeepMindControl("cartpole_balance", pixels=False)
     environment.pixels = True
 
@@ -177,7 +177,7 @@ def test_a_camera_that_does_not_exist_is_one_sentence(backend):
         EnvironmentProcess(find_environment("cartpole_swingup", backend=backend, camera=9))
 
 
-def test_a_process_that_imported_the_suite_for_another_backend_is_told():
+def test_importing_the_suite_for_another_backend_is_refused():
     # This very process has imported it without rendering.
     with pytest.raises(
         ForbesError, match=r"has imported dm_control with MUJOCO_GL=.*, expected egl.*EnvironmentProcess"

@@ -95,7 +95,7 @@ def test_a_seed_is_an_episode_and_the_time_limit_cuts_it():
     assert (episodes[0][-1].terminated, episodes[0][-1].truncated) == (False, True)
 
 
-def test_one_of_several_actions_is_one_hot_and_a_number_observed_is_so_too():
+def test_a_discrete_action_and_observation_are_one_hot():
     environment = Gymnasium("forbes/Camera-v0")
     assert environment.discrete
     assert (environment.action_dim, environment.observation_shape) == (3, (3,))
@@ -125,7 +125,7 @@ def test_pixels_are_what_it_draws_made_smaller():
         ("toy_gymnasium:Toy-Room-v0", "gymnasium has no such environment. Did you mean Toy-Rooms-v0"),
         ("no_such_package:Thing-v0", "no_such_package:Thing-v0: gymnasium has no such environment"),
         ("forbes/Needy-v0", "forbes/Needy-v0: Box2D is not installed"),
-        ("forbes/Levers-v0", "its actions are a MultiDiscrete, expected a Box or a Discrete. Wrap it"),
+        ("forbes/Levers-v0", "its actions are a MultiDiscrete, expected a Box or a Discrete. Wrap and register it"),
     ],
 )
 def test_what_cannot_be_used_is_one_sentence(task, sentence):
@@ -203,7 +203,7 @@ def test_a_smaller_image_is_the_mean_of_what_each_pixel_covers(monkeypatch):
     np.testing.assert_array_equal(environment.reset(0).observation, expected)
 
 
-def test_parts_come_one_after_the_other_and_whole_numbers_are_scaled(monkeypatch):
+def test_parts_are_concatenated_and_whole_numbers_are_scaled(monkeypatch):
     space = Tuple((Box(-9.0, 9.0, (2,)), Box(10, 20, (2,), np.int64), Dict(b=MultiDiscrete([2, 3]), a=Text(9))))
     value = (np.array([-8.0, 0.5], np.float32), np.array([10, 15]), {"a": "word", "b": np.array([1, 0])})
 
@@ -213,7 +213,7 @@ def test_parts_come_one_after_the_other_and_whole_numbers_are_scaled(monkeypatch
     assert seen.dtype == np.float32
 
 
-def test_bytes_of_a_memory_are_scaled_and_numbers_without_bounds_are_not(monkeypatch):
+def test_bytes_are_scaled_and_unbounded_numbers_are_not(monkeypatch):
     memory = np.array([0, 51, 255], np.uint8)
     assert environment_of(monkeypatch, Box(0, 255, (3,), np.uint8), memory).reset(0).observation.tolist() == [
         0,
@@ -310,7 +310,7 @@ NODES = Graph(Box(-1.0, 1.0, (2,)), None)
     ],
 )
 def test_a_space_that_is_no_array_is_refused_by_name(space, sentence, monkeypatch):
-    with pytest.raises(ForbesError, match="registers it, and name that: gymnasium:MODULE:ID") as error:
+    with pytest.raises(ForbesError, match="in a module of your own, and use: gymnasium:MODULE:ID") as error:
         environment_of(monkeypatch, space)
     assert sentence in str(error.value)
 
@@ -318,7 +318,10 @@ def test_a_space_that_is_no_array_is_refused_by_name(space, sentence, monkeypatc
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"pixels": True}, "it draws no pictures (render_mode rgb_array), expected them for pixels. Leave pixels out"),
+        (
+            {"pixels": True},
+            "it does not render images (render_mode rgb_array), as needed for pixels. Do not set pixels",
+        ),
         ({"part": "image"}, "part is 'image', expected one of a Dict"),
     ],
 )

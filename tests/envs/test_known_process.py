@@ -26,7 +26,7 @@ def test_a_seed_is_an_episode(task):
     assert not all(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
 
 
-def test_the_exact_filter_believes_an_episode_as_much_as_a_draw_of_the_process():
+def test_an_episode_is_as_likely_as_a_draw_of_the_process():
     """The evidence of both has the same mean: an action one step aside, or in other units, costs many nats."""
     process, environment, steps = MountainHike(), find_environment("mountain_hike")(), 75
     # All chance of a hike is Gaussian, whatever the actions, so each step's evidence has the same law.
@@ -118,25 +118,25 @@ def test_half_an_action_is_half_a_step():
 def test_a_process_without_rewards_is_one_sentence():
     environment = KnownProcess(MirrorSensor(cells=401))
     environment.reset(0)
-    with pytest.raises(ForbesError, match=r"^MirrorSensor: has no rewards, expected a process that gives them"):
+    with pytest.raises(ForbesError, match=r"^MirrorSensor: has no rewards, expected a process with rewards"):
         environment.step(np.zeros(0, np.float32))
 
 
 def test_names_that_are_nearly_right_are_suggested():
     with pytest.raises(ForbesError, match=r"^mountain_hik: no such task\. Did you mean mountain_hike\?$"):
         find_environment("mountain_hik")
-    with pytest.raises(ForbesError, match=r"^tiger: its environment has no option camera\. Leave it out$"):
+    with pytest.raises(ForbesError, match=r"^tiger: its environment has no option camera\. Remove it$"):
         find_environment("tiger", camera=1)
 
 
-def test_an_environment_of_a_module_that_is_not_allowed_is_no_task():
+def test_an_environment_of_a_forbidden_module_is_no_task():
     """It was taken for one of DeepMind Control, which lacked its options."""
     with pytest.raises(ForbesError, match=r"^Parakeet: no such task\..* needs --allow-module MODULE$"):
         find_environment("Parakeet", steps=8)
 
 
 @pytest.mark.parametrize("task", ["mountain_hike", "multi_start_hike", "t_maze", "tiger"])
-def test_with_the_exact_belief_an_episode_is_the_same_and_its_belief_is_shown(task):
+def test_showing_the_exact_belief_does_not_change_the_episode(task):
     """Beside the ordinary episode of the same seed and actions, whose observations are filtered at the end."""
     plain, shown = find_environment(task)(), find_environment(task, shows="exact_belief")()
     process = plain.process
@@ -157,7 +157,7 @@ def test_with_the_exact_belief_an_episode_is_the_same_and_its_belief_is_shown(ta
 
 
 def test_refuses_to_show_a_belief_of_too_many_numbers():
-    with pytest.raises(ForbesError, match="shows: the exact belief is a GridBelief of too many numbers"):
+    with pytest.raises(ForbesError, match="shows: the exact belief is a GridBelief with too many parameters"):
         KnownProcess(MirrorSensor(), shows="exact_belief")
 
 

@@ -39,12 +39,12 @@ def test_the_first_backend_that_renders_is_taken(unasked, monkeypatch):
     assert choose_backend() == answers["osmesa"]
 
 
-def test_what_the_user_asks_for_is_proved_and_nothing_else_is_tried(unasked, monkeypatch):
+def test_only_the_backend_that_the_user_chose_is_probed(unasked, monkeypatch):
     asked = []
     monkeypatch.setattr(rendering, "probe_backend", lambda name: asked.append(name) or Probe(name, problem="broken"))
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
 
-    with pytest.raises(ForbesError, match=r"MUJOCO_GL=osmesa gives no picture \(osmesa: broken\)"):
+    with pytest.raises(ForbesError, match=r"MUJOCO_GL=osmesa does not render \(osmesa: broken\)"):
         choose_backend()
     assert asked == ["osmesa"]
 
@@ -55,8 +55,8 @@ def test_without_a_backend_there_is_one_sentence(unasked, monkeypatch):
     with pytest.raises(ForbesError) as error:
         choose_backend()
     assert str(error.value) == (
-        "rendering: no backend gives a picture (egl: egl is broken; osmesa: osmesa is broken). `forbes doctor` "
-        "has the remedy; vectors need no rendering: --no-pixels"
+        "rendering: no backend renders (egl: egl is broken; osmesa: osmesa is broken). Run `forbes doctor` "
+        "for a remedy, or observe vectors with --no-pixels"
     )
 
 
@@ -67,7 +67,7 @@ def test_a_gpu_that_does_not_draw_is_noticed(monkeypatch):
     assert Probe("egl", "NVIDIA H100", 900.0).remedy == ""
 
 
-def test_collecting_pixels_where_nothing_renders_ends_with_one_sentence(tmp_path, monkeypatch, capsys):
+def test_collecting_pixels_without_rendering_is_one_sentence(tmp_path, monkeypatch, capsys):
     pytest.importorskip("dm_control")
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
 
@@ -75,5 +75,5 @@ def test_collecting_pixels_where_nothing_renders_ends_with_one_sentence(tmp_path
 
     output = capsys.readouterr().err
     assert status == 2
-    assert output.startswith("forbes: rendering: MUJOCO_GL=nonsense gives no picture")
+    assert output.startswith("forbes: rendering: MUJOCO_GL=nonsense does not render")
     assert output.count("\n") == 1

@@ -48,7 +48,7 @@ def test_it_lives_elsewhere_and_without_torch(echo):
 
 
 @pytest.mark.parametrize(("ends", "limit"), [(None, 4), (4, 4), (6, 4), (4, 6)])
-def test_an_episode_is_truncated_at_the_limit_of_steps_unless_it_ends_before(ends, limit):
+def test_an_episode_is_truncated_at_the_limit_unless_it_ended(ends, limit):
     """`ends` is the step at which the process itself terminates: an end at the limit stays an end."""
     with EnvironmentProcess(partial(Echo, ends, True), time_limit=limit) as environment:
         for _ in range(2):  # the count begins again with each reset
@@ -71,8 +71,8 @@ def test_the_shorter_of_two_time_limits_is_told(limit, expected):
 SENTENCES = {
     "raises": "step raises ArithmeticError: the physics has exploded",
     "hangs": "it hangs, no answer to step within 2 s",
-    "dies": "its process has died in step, exit code -9",
-    "leaves": "its process has died in step, exit code 7",
+    "dies": "its process died in step, exit code -9",
+    "leaves": "its process died in step, exit code 7",
     "rewards_nan": "step raises ValueError: the reward is nan, expected a finite number",
     "sees_nan": "step raises ValueError: the observation is not finite",
     "sees_another_shape": "the observation is float32 (3,), expected float32 (2,)",
@@ -98,7 +98,7 @@ def test_after_trouble_the_next_reset_starts_anew(trouble, tmp_path):
 
 @pytest.mark.parametrize("where", ["start", "reset"])
 @pytest.mark.parametrize("trouble", ["raises", "hangs", "leaves"])
-def test_trouble_before_the_first_step_is_a_sentence_and_leaves_no_process(where, trouble, monkeypatch):
+def test_early_trouble_is_one_sentence_and_leaves_no_process(where, trouble, monkeypatch):
     monkeypatch.setattr(worker, "START_LIMIT", 3.0 if (where, trouble) == ("start", "hangs") else 60.0)
     begun = set(multiprocessing.active_children())
 
@@ -108,13 +108,13 @@ def test_trouble_before_the_first_step_is_a_sentence_and_leaves_no_process(where
     sentences = {
         "raises": f"{where} raises ArithmeticError: the physics has exploded",
         "hangs": f"it hangs, no answer to {where} within 3 s",
-        "leaves": f"its process has died in {where}, exit code 7",
+        "leaves": f"its process died in {where}, exit code 7",
     }
     assert str(error.value).startswith(f"{'Unready' if where == 'start' else 'Echo'}: {sentences[trouble]}")
     assert set(multiprocessing.active_children()) <= begun
 
 
-def test_an_interrupt_leaves_no_answer_behind_that_is_taken_for_another(echo, monkeypatch):
+def test_an_interrupt_leaves_no_answer_for_the_next_request(echo, monkeypatch):
     echo.reset(1)
     with monkeypatch.context() as patch:
         patch.setattr(type(echo._connection), "poll", lambda *_: exec("raise KeyboardInterrupt"))
@@ -138,10 +138,10 @@ def test_a_signal_to_a_process_that_starts_is_left_to_its_parent(number, monkeyp
 
 
 @pytest.mark.parametrize("sent", [0, 100])
-def test_a_process_that_dies_before_or_within_its_answer_has_died(sent, tmp_path):
+def test_a_death_before_or_during_an_answer_is_reported(sent, tmp_path):
     """A connection tells the two apart: by an EOFError and an OSError."""
     with EnvironmentProcess(partial(Severed, sent)) as environment:
-        with pytest.raises(BrokenEnvironmentError, match="Echo: its process has died in reset, exit code 7"):
+        with pytest.raises(BrokenEnvironmentError, match="Echo: its process died in reset, exit code 7"):
             environment.reset(0)
 
 
@@ -171,7 +171,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_it_ends_with_its_parent_even_within_a_step_that_never_returns(tmp_path):
+def test_it_ends_with_its_parent_even_in_an_endless_step(tmp_path):
     program = """
 import sys
 from functools import partial
@@ -210,7 +210,7 @@ def test_a_script_without_a_guard_is_told_what_it_lacks(tmp_path):
     done = run_script(tmp_path, "EnvironmentProcess(find_environment('tiger'))\n")
 
     assert done.returncode != 0
-    assert 'keep its commands under `if __name__ == "__main__":`' in done.stderr.splitlines()[-1]
+    assert 'guard its code with `if __name__ == "__main__":`' in done.stderr.splitlines()[-1]
 
 
 NOTEBOOK = """
@@ -236,7 +236,7 @@ NAMES = ("Room", "Room", "furnish")
 
 def assert_told_to_move(name, sentence):
     assert sentence.startswith(f"{name}: it is defined in a notebook or on standard input, which")
-    assert sentence.endswith("Define it at the top of a module file, and import it from there")
+    assert sentence.endswith("Define it at the top level of a module file, and import it from there")
 
 
 def run_notebook(*flags, stdin=None):
@@ -261,8 +261,8 @@ def test_a_script_on_standard_input_is_told_to_move_to_a_file():
     for name, sentence in zip(NAMES, done.stdout.splitlines(), strict=True):
         assert_told_to_move(name, sentence)
     assert done.stderr.splitlines()[-1].endswith(
-        "Echo: commands on standard input cannot start the process of an environment, which reads them again. "
-        "Write them to a file"
+        "Echo: code on standard input cannot start the worker process of an environment, which re-imports it. "
+        "Write it to a file"
     )
 
 
@@ -272,6 +272,6 @@ def test_what_cannot_be_sent_to_another_process_is_one_sentence():
 
     for make in (Local, lambda: Echo()):
         with pytest.raises(
-            ForbesError, match=r"it cannot be sent to another process .* Define it at the top of a module"
+            ForbesError, match=r"it cannot be sent to another process .* Define it at the top level of a module"
         ):
             EnvironmentProcess(make)

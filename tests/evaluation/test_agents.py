@@ -80,7 +80,7 @@ def test_acting_on_many_trajectories_is_a_measurement_of_its_own(run, capsys):
     assert "--acting-samples" in capsys.readouterr().err
 
 
-def test_an_agent_trained_on_many_trajectories_explores_and_is_measured_on_them(tmp_path):
+def test_acting_samples_are_used_to_explore_and_to_evaluate(tmp_path):
     """Unless another number is asked for."""
     runs = one, many = tmp_path / "1", tmp_path / "4"
     for run in runs:
@@ -98,7 +98,7 @@ def test_an_agent_trained_on_many_trajectories_explores_and_is_measured_on_them(
     assert guess != own
 
 
-def test_an_agent_is_held_against_one_that_is_shown_something_else(tmp_path, capsys):
+def test_agents_with_different_observations_are_compared(tmp_path, capsys):
     """What one is shown changes nothing of what is paid, so the difference has a meaning."""
     task = ("--data.source.task", "tiger", "--trainer.max_epochs", 1)
     runs = [tmp_path / shown for shown in ("observation", "exact_belief")]

@@ -112,7 +112,7 @@ def test_a_mode_that_is_too_heavy_is_an_error_of_its_excess():
     torch.testing.assert_close(by_cells, torch.tensor([[0.4]], dtype=torch.float64), rtol=0, atol=1e-9)
 
 
-def test_on_the_mirror_sensor_a_matched_gaussian_keeps_the_masses_but_is_far_away():
+def test_a_matched_gaussian_keeps_the_masses_but_is_far_away():
     """1.160 ± 0.007 nats is the forward KL in the mean of 4000 sequences of 30 steps."""
     process = MirrorSensor(cells=801)
     state, exact = drawn(process, sequences=100, steps=30)

@@ -23,7 +23,7 @@ def test_nats_per_step_divide_all_nats_by_all_steps():
     assert estimate.standard_error == pytest.approx(math.sqrt((8**2 + 7**2 + 15**2) / 2) * 0.3 / math.sqrt(3))
 
 
-def test_a_bootstrap_interval_of_many_values_is_that_of_the_normal_distribution():
+def test_bootstrap_interval_of_many_values_is_the_normal_one():
     values = torch.randn(4000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     low, high = bootstrap_interval(values)

@@ -45,7 +45,7 @@ def seeded(model, data, batch, samples=3):
     return complete(model, data.source, batch, 4, samples)
 
 
-def test_a_completion_has_a_frame_for_each_step_that_was_not_seen(model, data, batch):
+def test_a_completion_has_a_frame_for_each_unseen_step(model, data, batch):
     completions = seeded(model, data, batch)
 
     assert completions.frames.shape == (3, 5, 5, 1, 28, 28)
@@ -81,7 +81,7 @@ def fields(batch, steps):
     return {name: getattr(batch, name)[:, steps] for name in ("observation", "action", "mask")}
 
 
-def test_samples_of_a_belief_are_rolled_on_by_the_actions_of_their_sequence(model, batch):
+def test_belief_samples_follow_the_actions_of_their_sequence(model, batch):
     belief = filter(model, batch, samples=2)
     assert belief.hidden.shape == (10, 4)
     assert belief.state.shape == (10, 2)
@@ -93,7 +93,7 @@ def test_samples_of_a_belief_are_rolled_on_by_the_actions_of_their_sequence(mode
     assert not rollout.state.requires_grad
 
 
-def test_a_belief_of_other_sequences_than_the_actions_is_one_sentence(model, batch):
+def test_a_belief_that_does_not_match_the_actions_is_refused(model, batch):
     belief = filter(model, batch, samples=2)
 
     with pytest.raises(ForbesError, match="the belief has 10 rows, expected a multiple of the 4 sequences of action"):
@@ -124,7 +124,7 @@ def test_a_sample_keeps_its_own_trajectory(model, data, batch):
                 torch.testing.assert_close(together.frames[n, b], alone[0])
 
 
-def test_whole_sequences_end_with_the_longest_and_are_no_shorter_than_the_data(data):
+def test_whole_sequences_reach_the_longest_and_the_data_length(data):
     index = torch.arange(12)
     points = torch.from_numpy(data.source.arrays("test").offsets).diff()
 

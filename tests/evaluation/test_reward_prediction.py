@@ -1,4 +1,4 @@
-"""How much of the reward a world model foresees: exact for models that know all, or only the mean."""
+"""Reward prediction of a world model: exact for models that know everything, or only the mean."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from forbes.data.episodes.episode import Episode
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.record import read_record
-from forbes.evaluation.reward_prediction import STEPS_AHEAD, explained, predict_rewards
+from forbes.evaluation.reward_prediction import STEPS_AHEAD, predict_rewards, r2_by_steps_ahead
 from forbes.models import Filtered, Rollout, State
 
 
@@ -47,54 +47,58 @@ def paid(episode):
 
 
 @pytest.mark.parametrize("steps", [16, 40])
-def test_who_knows_the_world_foretells_each_reward_at_every_distance(steps):
+def test_a_model_that_knows_the_world_predicts_each_reward(steps):
     """A shift by one step, of actions, rewards or beliefs, would show: no two steps are alike."""
     episodes = [walk(steps, seed) for seed in range(3)]
 
-    foretold = [predict_rewards(Walk(torch.square), episode, number, "") for number, episode in enumerate(episodes)]
+    predicted = [predict_rewards(Walk(torch.square), episode, number, "") for number, episode in enumerate(episodes)]
 
-    for told, episode in zip(foretold, episodes, strict=True):
-        for one, distance in zip(told, STEPS_AHEAD, strict=True):
-            first = max(distance - 1, 0)  # o_1 is before r_2, so that a belief 1 step before it is there
-            torch.testing.assert_close(one, paid(episode)[first:], rtol=1e-4, atol=1e-4)
-    for share in explained(foretold, [paid(episode) for episode in episodes]):
-        assert share == pytest.approx((1, 0), abs=1e-6)
+    for by_ahead, episode in zip(predicted, episodes, strict=True):
+        assert tuple(by_ahead) == STEPS_AHEAD
+        for ahead, rewards in by_ahead.items():
+            first = max(ahead - 1, 0)  # o_1 is before r_2, so that there is a belief 1 step before it
+            torch.testing.assert_close(rewards, paid(episode)[first:], rtol=1e-4, atol=1e-4)
+    for r2 in r2_by_steps_ahead(predicted, [paid(episode) for episode in episodes]).values():
+        assert r2 == pytest.approx((1, 0), abs=1e-6)
 
 
-def test_who_does_not_know_what_actions_do_foretells_the_nearer_the_better():
+def test_a_model_that_ignores_actions_predicts_near_rewards_better():
     episodes = [walk(40, seed) for seed in range(5)]
 
-    told = [
+    predicted = [
         predict_rewards(Walk(torch.square, drift=0.0), episode, number, "") for number, episode in enumerate(episodes)
     ]
-    shares = [share.mean for share in explained(told, [paid(episode) for episode in episodes])]
+    r2 = [r2.mean for r2 in r2_by_steps_ahead(predicted, [paid(episode) for episode in episodes]).values()]
 
-    assert shares[0] == pytest.approx(1)
-    assert shares == sorted(shares, reverse=True)
-    assert shares[-1] < 0.5
+    assert r2[0] == pytest.approx(1)
+    assert r2 == sorted(r2, reverse=True)
+    assert r2[-1] < 0.5
 
 
-def test_the_mean_explains_nothing_and_what_is_further_off_less_than_that():
+def test_the_mean_has_an_r2_of_zero_and_worse_predictions_less():
     rewards = [torch.tensor([1.0, 2.0, 3.0]).double(), torch.tensor([2.0, 4.0]).double()]
     mean = torch.cat(rewards).mean()
-    told = [[mean.expand(len(one))] * len(STEPS_AHEAD) for one in rewards]
+    predicted = [dict.fromkeys(STEPS_AHEAD, mean.expand(len(reward))) for reward in rewards]
+    worse = [{ahead: prediction + 1 for ahead, prediction in by_ahead.items()} for by_ahead in predicted]
 
-    assert [share.mean for share in explained(told, rewards)] == pytest.approx([0] * len(STEPS_AHEAD))
-    assert all(share.mean < 0 for share in explained([[guess + 1 for guess in one] for one in told], rewards))
+    assert [r2.mean for r2 in r2_by_steps_ahead(predicted, rewards).values()] == pytest.approx([0] * len(STEPS_AHEAD))
+    assert all(r2.mean < 0 for r2 in r2_by_steps_ahead(worse, rewards).values())
 
 
-def test_no_share_where_no_episode_is_long_enough_or_all_rewards_are_equal():
+def test_there_is_no_r2_of_short_episodes_or_equal_rewards():
     short = [walk(6, seed) for seed in range(2)]
-    told = [predict_rewards(Walk(torch.square), episode, 0, "") for episode in short]
+    predicted = [predict_rewards(Walk(torch.square), episode, 0, "") for episode in short]
 
-    assert [share is None for share in explained(told, [paid(episode) for episode in short])] == [False] * 3 + [True]
+    r2 = r2_by_steps_ahead(predicted, [paid(episode) for episode in short])
+    assert [ahead for ahead, estimate in r2.items() if estimate is None] == [15]
 
     level = [torch.ones(20).double()] * 2
-    assert explained([[level[0]] * len(STEPS_AHEAD)] * 2, level) == [None] * len(STEPS_AHEAD)
+    same = r2_by_steps_ahead([dict.fromkeys(STEPS_AHEAD, level[0])] * 2, level)
+    assert same == dict.fromkeys(STEPS_AHEAD)
 
 
-def test_a_reward_that_is_not_a_number_is_said():
-    with pytest.raises(ForbesError, match="run, test episode 7: the world model foretells rewards that are not finite"):
+def test_a_predicted_reward_that_is_not_finite_is_an_error():
+    with pytest.raises(ForbesError, match="run, test episode 7: the world model predicts rewards that are not finite"):
         predict_rewards(Walk(lambda place: place / 0), walk(6), 0, "run, test episode 7")
 
 

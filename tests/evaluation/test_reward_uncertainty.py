@@ -50,7 +50,7 @@ def test_a_linear_rewards_variance_is_that_of_the_kalman_filter():
     torch.testing.assert_close(drawn, exact, rtol=5 * 3 * math.sqrt(2 / DRAWS / 40), atol=0)
 
 
-def test_a_step_is_known_but_for_its_own_noise_and_what_is_seen_of_it():
+def test_a_step_is_uncertain_by_its_noise_less_what_is_seen():
     """Var[s_t - s_t-1 | o_1:t]: the noise of the step, less what the last observation tells about it."""
     process = Returns(observation_std=0.1)
     episode = episode_of(process)
@@ -100,7 +100,7 @@ class Believer(nn.Module):
 
 
 @pytest.mark.parametrize("start", ["single", "multi"])
-def test_who_has_the_exact_belief_is_as_unsure_as_it_and_who_has_its_mean_is_sure(start):
+def test_uncertainty_is_1_for_an_exact_belief_and_0_for_a_mean(start):
     process = MountainHike(start, observation_std=1.5)
     episodes = [episode_of(process) for _ in range(3)]
     exact = [exact_variance(process, episode, seed) for seed, episode in enumerate(episodes)]

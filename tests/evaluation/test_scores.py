@@ -135,7 +135,7 @@ def test_an_open_loop_follows_the_actions_that_were_taken():
         torch.testing.assert_close(scores[metric], expected)
 
 
-def test_scores_of_frames_are_float64_whatever_the_model_computes_in():
+def test_frame_scores_are_float64_whatever_the_model_uses():
     """A logarithm of a mean over particles cancels: of 1e5 nats float32 loses 0.004."""
     model, batch = make_model(), make_batch()
     model.log_likelihood = lambda features, target: torch.full(features.shape[:-1], -1e5, dtype=torch.float32)
@@ -191,7 +191,7 @@ def test_the_fivo_bound_is_the_one_that_particles_are_trained_by():
     assert (scores["ess"][batch.mask] < 0.5).any()
 
 
-def test_the_reported_value_is_the_mean_over_samples_and_depends_on_the_seed_alone():
+def test_reported_value_is_a_sample_mean_and_fixed_by_the_seed():
     model, batch = make_model(FlowBelief), make_batch()
     mine = elbo(model, in_batches(batch, 7), samples=4, seed=2)["elbo"]
 

@@ -41,14 +41,14 @@ OUT_OF_MEMORY = [
 
 @pytest.mark.parametrize("error", OUT_OF_MEMORY, ids=["cuda", "cpu"])
 @pytest.mark.parametrize("limit", [1, 2, 3, 4])
-def test_a_batch_for_which_the_memory_does_not_suffice_is_halved_loudly(limit, error, capsys):
+def test_a_batch_too_large_for_memory_is_halved_loudly(limit, error, capsys):
     scores = score_split(nn.Linear(1, 1), batches(), hungry(limit, error), where="runs/a, test split")
 
     torch.testing.assert_close(scores.values["number"].sum(1), STEPS * torch.arange(10, dtype=torch.float64))
     assert "runs/a, test split: no memory for 5 sequences at once, trying 2" in capsys.readouterr().err
 
 
-def test_a_sequence_that_does_not_fit_alone_is_an_error_with_a_remedy():
+def test_a_single_sequence_beyond_memory_gives_a_remedy():
     with pytest.raises(ForbesError, match=r"runs/a: no memory for one sequence with K=9. Choose fewer particles"):
         score_split(nn.Linear(1, 1), batches(), hungry(0, OUT_OF_MEMORY[0]), where="runs/a")
 

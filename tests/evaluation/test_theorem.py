@@ -13,8 +13,8 @@ from torch.distributions import MultivariateNormal
 
 from forbes.commands.cli import main
 from forbes.evaluation.theorem import (
+    ClosedFormProcess,
     Conditional,
-    LinearGaussian,
     belief_scores,
     between,
     elbo,
@@ -29,7 +29,7 @@ from forbes.evaluation.theorem import (
 )
 
 CASES = {"1,1,1": (1.0, 1.0, 1.0), "1,.1,1": (1.0, 0.1, 1.0), ".9,.3,.5": (0.9, 0.3, 0.5)}
-PROCESSES = [LinearGaussian(*case) for case in CASES.values()] + [LinearGaussian(-0.7, 2.0, 0.3, 6, 0.4)]
+PROCESSES = [ClosedFormProcess(*case) for case in CASES.values()] + [ClosedFormProcess(-0.7, 2.0, 0.3, 6, 0.4)]
 POSTERIORS = [exact_filter, exact_one_step, factorised_optimum, structured_optimum, smoothing]
 
 
@@ -50,8 +50,8 @@ def outer_product_of_a_sequence(process):
 
 @pytest.mark.parametrize("process", PROCESSES, ids=str)
 @pytest.mark.parametrize("posterior_of", [*POSTERIORS, arbitrary])
-@pytest.mark.parametrize("moment_of", [LinearGaussian.moment, outer_product_of_a_sequence])
-def test_what_the_elbo_misses_is_the_kl_to_the_smoothing_conditionals(process, posterior_of, moment_of):
+@pytest.mark.parametrize("moment_of", [ClosedFormProcess.moment, outer_product_of_a_sequence])
+def test_the_elbo_gap_is_the_kl_to_the_smoothing_conditionals(process, posterior_of, moment_of):
     posterior, moment = posterior_of(process), moment_of(process)
 
     gap = log_evidence(process, moment) - elbo(process, posterior, moment)
@@ -79,8 +79,8 @@ def test_the_exact_posterior_has_no_gap_in_any_sample(process):
 
 
 @pytest.mark.parametrize(("case", "error"), [("1,1,1", 5.19), ("1,.1,1", 32.6), (".9,.3,.5", 6.06)])
-def test_the_papers_form_is_wrong_by_the_whole_gap_of_the_exact_filter(case, error):
-    process = LinearGaussian(*CASES[case])
+def test_the_papers_form_is_wrong_by_the_exact_filters_gap(case, error):
+    process = ClosedFormProcess(*CASES[case])
     posterior, moment = exact_filter(process), process.moment()
 
     paper = expected_kl(posterior, exact_filter(process), moment)
@@ -198,7 +198,7 @@ QUOTED = {
 
 @pytest.mark.parametrize(("case", "posterior_of"), QUOTED)
 def test_scores_are_those_quoted(case, posterior_of):
-    process = LinearGaussian(*CASES.get(case, (1.0, 1.0, 0.1)))
+    process = ClosedFormProcess(*CASES.get(case, (1.0, 1.0, 0.1)))
 
     scores = belief_scores(process, posterior_of(process))
 
@@ -209,7 +209,7 @@ def test_scores_are_those_quoted(case, posterior_of):
 
 
 def test_scores_are_means_over_simulated_sequences():
-    process = LinearGaussian(0.9, 0.3, 0.5, steps=4)
+    process = ClosedFormProcess(0.9, 0.3, 0.5, steps=4)
     belief, samples = structured_optimum(process).marginal(), 20_000
     factor = torch.linalg.cholesky(joint_covariance(process))
     generator = torch.Generator().manual_seed(0)
@@ -241,7 +241,7 @@ def test_scores_are_means_over_simulated_sequences():
     st.integers(2, 12),
 )
 def test_elbo_and_prediction_put_beliefs_in_opposite_orders(transition, sign, process_noise, observation_noise, steps):
-    process = LinearGaussian(sign * transition, process_noise, observation_noise, steps)
+    process = ClosedFormProcess(sign * transition, process_noise, observation_noise, steps)
     ends = exact_filter(process), factorised_optimum(process)
 
     scores = [belief_scores(process, between(*ends, share / 4)) for share in range(5)]
@@ -261,7 +261,7 @@ def printed():
     return rows, output.getvalue()
 
 
-def test_the_command_prints_both_sides_and_what_the_beliefs_are_worth(printed):
+def test_the_command_prints_both_sides_and_the_beliefs_worth(printed):
     rows, text = printed
     identity, beliefs, scan = rows[:12], rows[12:24], rows[24:]
 
@@ -300,9 +300,9 @@ def test_one_process_can_be_chosen(capsys):
         (["--steps", "0"], "0 is not a number above 0"),
         (["--steps", "201"], "201 is above 200"),
         (["--samples", "1"], "1 is below 2, a standard error needs two"),
-        (["--samples", "3000000"], "--samples 3000000: expected at most 2000000 of 15 steps"),
-        (["--transition", "40", "--steps", "100"], "F=40 Q=1 R=1: with 100 steps the numbers leave the precision"),
-        (["--transition", "4", "--steps", "20"], "F=4 Q=1 R=1: with 20 steps the numbers leave the precision"),
+        (["--samples", "3000000"], "--samples 3000000: expected at most 2000000 with 15 steps"),
+        (["--transition", "40", "--steps", "100"], "F=40 Q=1 R=1: with 100 steps the precision of float64"),
+        (["--transition", "4", "--steps", "20"], "F=4 Q=1 R=1: with 20 steps the precision of float64"),
         (["surplus"], "unrecognized arguments: surplus"),
     ],
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 TESTS = Path(__file__).resolve().parents[1]
 
 
-def test_what_is_broken_off_goes_on_and_what_is_wrong_is_a_sentence():
+def test_kills_are_resumed_and_bad_inputs_are_one_sentence():
     """It forks, and so has a process of its own, without the threads of this one."""
     command = [sys.executable, "-m", "faults", "--kills", "20", "--inputs", "200", "--starts", "5", "--epochs", "30"]
     path = os.pathsep.join(filter(None, [str(TESTS), os.environ.get("PYTHONPATH")]))

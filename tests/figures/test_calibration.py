@@ -52,7 +52,7 @@ def test_the_histogram_is_the_density_of_the_ranks(beliefs, figure):
     assert drawn[0] == pytest.approx((20 * counts / COUNT).tolist(), rel=1e-6)
 
 
-def test_the_second_panel_is_the_distribution_function_less_the_uniform_one(beliefs, figure):
+def test_second_panel_is_the_cdf_minus_the_uniform_one(beliefs, figure):
     line, _ = lines_of(figure.axes[1], ORANGE)
 
     for k in (0, 7, SAMPLES):
@@ -70,7 +70,7 @@ def test_coverage_is_drawn_against_the_level(beliefs, figure):
 
 
 @pytest.mark.parametrize("panel", [1, 2])
-def test_the_exact_belief_keeps_to_the_band_and_the_narrow_one_leaves_it(figure, panel):
+def test_exact_beliefs_stay_in_the_band_and_narrow_ones_do_not(figure, panel):
     axes = figure.axes[panel]
     band = band_of(axes)
 
@@ -89,7 +89,7 @@ def test_it_says_what_is_drawn(figure, tmp_path):
     assert labels == [
         ("rank of the true value / L", "density of ranks"),
         ("rank of the true value / L", "ECDF − uniform"),
-        ("nominal level of the region", "true values within"),
+        ("nominal level of the region", "true values inside"),
     ]
     assert [text.get_text() for text in legend.get_texts()] == ["exact", "narrow", "calibrated, 95 %"]
     save_figure(figure, tmp_path / "calibration.pdf")

@@ -77,7 +77,7 @@ def test_a_run_that_was_trained_is_drawn(tmp_path):
 
 def test_what_cannot_be_drawn_is_one_sentence(runs, tmp_path, capsys):
     for arguments, sentence in [
-        ([runs("a-0"), runs("b-0", task="Slide")], "--runs: they are of Parrot and Slide, expected one task"),
+        ([runs("a-0"), runs("b-0", task="Slide")], "--runs: the tasks are Parrot and Slide, expected one task"),
         ([str(tmp_path / "absent")], "absent/metrics.jsonl: no such file"),
         ([runs("c-0", returns=())], "metrics.jsonl has no return/acting"),
     ]:

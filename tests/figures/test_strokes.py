@@ -17,7 +17,7 @@ from forbes.data import SequenceDataModule, Strokes
 from forbes.data.strokes.file import StrokeArrays, save_strokes
 from forbes.evaluation.runs import load_runs
 from forbes.figures.grids import Panel, draw_panels
-from forbes.figures.strokes import Family, ambiguous_digits, elbo_against_updates
+from forbes.figures.strokes import FamilyCurves, ambiguous_digits, elbo_against_updates
 from forbes.figures.style import BLACK, BLUE, ORANGE, paper_style, save_figure
 from forbes.runs.folder import read_metrics
 
@@ -71,14 +71,14 @@ def test_runs_that_differ_in_the_seed_only_are_one_family(runs, tmp_path):
     assert families[0].colour != families[1].colour
 
 
-def test_families_of_one_name_are_told_apart_by_what_their_folders_do_not_share(runs, tiny_config, tmp_path):
+def test_families_of_one_name_are_told_apart_by_their_folders(runs, tiny_config, tmp_path):
     one, other = str(shutil.copytree(runs[0], tmp_path / "flat")), str(tmp_path / "deep")
     main(["fit", "--config", str(tiny_config), "--run_dir", other, "--model.init_args.belief.init_args.layers", "3"])
     names = [family.name for family in group(load_runs([one, other]))]
     assert names == ["FORBES (flat)", "FORBES (deep)"]
 
 
-def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo(runs, tmp_path):
+def test_a_family_curve_is_the_mean_and_ends_in_the_test_elbo(runs, tmp_path):
     copies = [str(shutil.copytree(run, tmp_path / str(number))) for number, run in enumerate(runs)]
     first, second, rssm = load_runs(copies)
     for run, mean, checkpoint in [
@@ -100,13 +100,15 @@ def test_the_curve_of_a_family_is_the_mean_of_its_runs_and_ends_in_its_test_elbo
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [
         "FORBES, 2 runs",
         "RSSM",
-        "test, at the end",
+        "final test",
     ]
 
 
 def test_a_family_is_drawn_where_all_its_runs_have_values():
     curves = [pd.Series([-3.0, -2.0, -1.0], [10, 20, 30]), pd.Series([-5.0, -4.0], [10, 20])]
-    (axes,) = elbo_against_updates([Family("A", BLUE, SimpleNamespace(bound_name="elbo[S=1]"), curves, [])], {}).axes
+    (axes,) = elbo_against_updates(
+        [FamilyCurves("A", BLUE, SimpleNamespace(bound_name="elbo[S=1]"), curves, [])], {}
+    ).axes
     assert axes.get_ylabel() == "validation ELBO[S=1]\nnats per sequence"
     assert list(axes.lines[0].get_xdata()) == [10, 20]
     assert list(axes.lines[0].get_ydata()) == [-4.0, -3.0]
@@ -146,7 +148,7 @@ def make_strokes(path, prefixes):
     return SequenceDataModule(Strokes(path=str(path), validation=0), batch_size=2, length=4)
 
 
-def test_the_digit_of_each_class_with_the_most_open_beginning_is_chosen(tmp_path):
+def test_each_class_gives_the_digit_with_the_most_open_start(tmp_path):
     """At x = 0 all training digits are 1, at x = 20 all are 2, at x = 10 they are 1 or 2."""
     train = [(0, 1)] * 4 + [(20, 2)] * 4 + [(10, 1), (10, 2)] * 2
     test = [(0, 1), (20, 2), (10, 2), (10, 1), (10, 1)]
@@ -209,7 +211,7 @@ def test_a_panel_shows_each_frame_at_its_place_and_in_its_ink():
     assert len(widths) == 1
 
 
-def test_a_picture_replaces_the_one_before_and_leaves_nothing_else(tmp_path):
+def test_a_picture_replaces_the_old_one_without_leftovers(tmp_path):
     figure = draw_panels([Panel("a", torch.ones(1, 1, 1, 4, 4), BLUE)])
     for _ in range(2):
         save_figure(figure, tmp_path / "new" / "a.png")

@@ -141,7 +141,7 @@ def test_gradients_reach_every_parameter(kind):
     assert without_gradient(model) == []
 
 
-def test_gradients_of_an_untrained_model_reach_every_parameter_at_the_second_update(kind):
+def test_gradients_reach_every_parameter_by_the_second_update(kind):
     """The flow's last layers start at zero and block those before them, once."""
     model = make_model(kind)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)

@@ -69,7 +69,7 @@ def test_the_weight_scales_the_divergence_only():
     assert elbo_loss(terms(), free_nats=3.5, kl_weight=0.5).item() == pytest.approx(10 + 1.75)
 
 
-def test_the_loss_takes_the_closed_form_and_the_reported_bound_the_sample():
+def test_loss_uses_the_closed_form_and_the_bound_the_sample():
     both = terms(analytic=((2.0, 2.0), (2.0, 2.0)))
 
     assert elbo_loss(both).item() == pytest.approx(10 + 2)

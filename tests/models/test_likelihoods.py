@@ -111,7 +111,7 @@ def test_name_tells_the_densities_apart(likelihood, name):
 
 
 @pytest.mark.parametrize("bits", [1, 5, 7])
-def test_fewer_bits_keep_the_leading_ones_and_fill_the_rest_with_noise(bits):
+def test_fewer_bits_keep_the_leading_ones_and_add_noise(bits):
     """Uniform within its step, a byte is known to lie there and no better: mean and spread are those of the step."""
     bytes_ = torch.arange(256, dtype=torch.uint8)
     torch.manual_seed(0)

@@ -13,7 +13,7 @@ def process(request):
 
 
 @pytest.mark.parametrize("steps", [1, 3])
-def test_bound_is_at_most_the_evidence_and_its_exponential_averages_to_it(process, steps):
+def test_bound_is_at_most_evidence_and_its_exp_averages_to_it(process, steps):
     (model, exact), samples = process, 20_000
     observation = observations(steps, seed=steps)
     torch.manual_seed(0)
@@ -34,7 +34,7 @@ def test_bound_is_the_evidence_when_the_posterior_is_exact():
     torch.testing.assert_close(each, log_evidence(observation, *exact).expand(100), rtol=1e-5, atol=1e-5)
 
 
-def test_bound_falls_short_when_the_posterior_ignores_later_observations():
+def test_bound_is_loose_if_later_observations_are_ignored():
     model, exact = gaussian()
     observation, samples = observations(3, seed=0), 20_000
     torch.manual_seed(0)

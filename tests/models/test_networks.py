@@ -59,7 +59,7 @@ def test_convolutions_are_for_images_of_any_sides(channels, sides):
 
 @settings(deadline=None, derandomize=True)
 @given(first=st.integers(1, 30), layers=st.integers(1, 7), share=st.floats(0, 1))
-def test_kernels_lead_from_one_size_to_the_other_and_differ_by_one(first, layers, share):
+def test_kernels_connect_the_sizes_and_differ_by_one_at_most(first, layers, share):
     """From the smallest size, by kernels of 2, to one of kernels of 30."""
     last = 2**layers * first + int(28 * share * (2**layers - 1))
 
@@ -70,7 +70,7 @@ def test_kernels_lead_from_one_size_to_the_other_and_differ_by_one(first, layers
     assert reduce(lambda size, kernel: 2 * (size - 1) + kernel, kernels, first) == last
 
 
-def test_an_encoder_and_its_decoder_have_kernels_of_4_to_7_pixels():
+def test_encoder_and_decoder_kernels_have_4_to_7_pixels():
     """Wherever a side lies: a kernel below the stride of 2 would leave gaps, a wide one would cost much."""
     for side in range(4, 300):
         layers = [m for m in ConvDecoder(1, (1, side, 300), channels=1).net if isinstance(m, nn.ConvTranspose2d)]

@@ -97,7 +97,7 @@ def test_the_exponential_of_the_bound_averages_to_the_evidence(resampling):
     assert_mean_is(ratio, 1)
 
 
-def test_particles_are_redrawn_in_some_sequences_and_not_in_others(resampling):
+def test_particles_are_redrawn_in_some_sequences_only(resampling):
     """Without this, the tests of the bound would not see how they are redrawn."""
     model, _ = particle_model(4, resampling)
     encoded = seen_by(model, drawn(4, seed=4), 1000)
@@ -124,7 +124,7 @@ def test_more_particles_give_a_tighter_bound(resampling):
     assert sixteen.mean() < evidence + 4 * sixteen.std() / math.sqrt(400) + ROUNDING
 
 
-def test_the_belief_is_that_of_the_kalman_filter_where_trajectories_of_the_proposal_are_not(resampling):
+def test_beliefs_match_the_kalman_filter_unlike_trajectories(resampling):
     (model, exact), observation = particle_model(500, resampling), drawn(4, seed=4)
     filtered, _ = kalman(observation, exact[0], exact[2])
     torch.manual_seed(0)
@@ -188,7 +188,7 @@ def test_redrawn_particles_stand_for_the_same_measure(resampling, number, monkey
     torch.testing.assert_close(measure, log_weight[:, 0].exp(), rtol=0, atol=1e-3)  # the grid of u
 
 
-def test_gradients_pass_through_the_weights_of_soft_resampling_only():
+def test_only_soft_resampling_passes_gradients_to_the_weights():
     log_weight = log_weights(sequences=3).requires_grad_()
     torch.manual_seed(0)
 
@@ -200,7 +200,7 @@ def test_gradients_pass_through_the_weights_of_soft_resampling_only():
     assert (gradient != 0).any(0).all()
 
 
-def test_systematic_resampling_chooses_each_particle_as_often_as_its_weight_says():
+def test_systematic_resampling_draws_particles_by_their_weight():
     log_weight = torch.tensor([0.5, 0.25, 0.2, 0.05], dtype=torch.float64).log()[:, None].expand(4, 1000)
     uniform = (torch.arange(1000, dtype=torch.float64) + 0.5) / 1000
 

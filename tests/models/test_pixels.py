@@ -15,7 +15,7 @@ def frames():
     return torch.cat((torch.zeros_like(pixels[:1]), pixels))
 
 
-def test_the_look_up_is_a_linear_layer_of_pixels_rows_and_columns():
+def test_the_lookup_is_linear_in_pixels_rows_and_columns():
     torch.manual_seed(0)
     encoder, frame = PixelEncoder(SHAPE, width=5).double(), frames()
     torch.nn.init.normal_(encoder.bias)

@@ -152,7 +152,7 @@ def test_no_step_sees_later_observations_or_actions(family):
         assert by_action.ne(0).any(-1).any(0).tolist() == [step <= t for step in range(TIME)]
 
 
-def test_an_untrained_flow_model_equals_the_gaussian_one_in_every_term():
+def test_an_untrained_flow_model_equals_the_gaussian_one():
     gaussian, flow = make_model("gaussian", seed=0), make_model("flow", seed=1)
     missing, unexpected = flow.load_state_dict(gaussian.state_dict(), strict=False)
     flow.prior.base.load_state_dict(gaussian.prior.state_dict())

@@ -71,7 +71,7 @@ def test_the_probabilities_of_all_sequences_add_up_to_one():
     assert log_p.double().exp().sum().item() == pytest.approx(1, abs=1e-5)  # of float32
 
 
-def test_its_prequential_score_is_the_likelihood_for_any_number_of_particles(model):
+def test_prequential_score_is_exact_for_any_particle_number(model):
     observation, action, mask = sequences()
     mask[0, 3:] = False
     none = torch.zeros(BATCH, TIME, 0)
@@ -94,7 +94,7 @@ def test_filtering_goes_on_from_where_it_stopped(model):
     torch.testing.assert_close(second, whole[:, 3:])
 
 
-def test_the_first_imagined_step_is_the_prediction_and_later_ones_see_nothing(model):
+def test_imagination_starts_at_the_prediction_and_sees_nothing(model):
     observation, action, _ = sequences()
     encoded = model.encode(observation, action)
     belief = model.sample_beliefs(model.encode(observation[:, :3], action[:, :3]), 2)
@@ -113,7 +113,7 @@ def test_the_first_imagined_step_is_the_prediction_and_later_ones_see_nothing(mo
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.65, 0.999])
-def test_overshooting_is_the_mean_over_the_steps_after_a_start_of_each_sequences_own(model, share, monkeypatch):
+def test_overshooting_is_a_mean_after_each_sequences_own_start(model, share, monkeypatch):
     monkeypatch.setattr(torch, "rand", lambda *shape, **options: torch.full(shape, share))
     observation, action, mask = sequences()
     lengths = [6, 1, 2, 4, 6]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
-from forbes.pomdps import CategoricalBelief, GaussianMixtureBelief, GridBelief
+from forbes.pomdps import FiniteBelief, GaussianMixtureBelief, GridBelief
 
 
 def random(*shape, seed=0):
@@ -27,7 +27,7 @@ def grid(*shape, cells=50):
 def categorical(*shape, values=5):
     log_mass = random(*shape, values)
     log_mass[..., 0] = -torch.inf  # impossible values are allowed
-    return CategoricalBelief(log_mass.log_softmax(-1))
+    return FiniteBelief(log_mass.log_softmax(-1))
 
 
 BELIEFS = {"gaussian": lambda *shape: mixture(*shape, components=1), "mixture": mixture, "grid": grid}
@@ -96,7 +96,7 @@ def test_a_mixture_is_differentiable_in_the_state():
     assert torch.autograd.gradcheck(mixture(4).log_prob, value)
 
 
-def test_a_grid_density_integrates_to_one_exactly_and_is_nothing_outside():
+def test_a_grid_density_integrates_to_one_and_is_zero_outside():
     belief = grid(2, 3)
     low, width = belief.centres[..., :1] - 0.05, 0.1  # (2, 3, 1)
     within = (torch.arange(200, dtype=torch.float64) + 0.5) / 4  # four points in each cell, (200,)

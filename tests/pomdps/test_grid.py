@@ -38,7 +38,7 @@ def test_of_a_linear_gaussian_it_is_the_kalman_filter():
     ],
     ids=["ungm-451", "ungm-901", "mirror-401"],
 )
-def test_a_finer_grid_changes_the_evidence_by_no_more_than_is_stated(coarse, fine, error):
+def test_a_finer_grid_changes_the_evidence_as_little_as_stated(coarse, fine, error):
     _, observation, action = draw(coarse, 6, 30)
 
     difference = coarse.log_likelihood(observation, action) - fine.log_likelihood(observation, action)

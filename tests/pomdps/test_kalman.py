@@ -57,7 +57,7 @@ def test_the_filter_is_the_dense_conditional(sequences, dense_joint, condition):
             assert evidence[row, : time + 1].sum().item() == pytest.approx(density.log_prob(past).item(), abs=1e-10)
 
 
-def test_several_starts_are_a_mixture_of_dense_conditionals_weighted_by_evidence(sequences, dense_joint, condition):
+def test_several_starts_are_a_mixture_weighted_by_evidence(sequences, dense_joint, condition):
     observation, drive = sequences
     system, starts = random_system(starts=3), 3
     state = random(B, T, D, seed=12)
@@ -99,7 +99,7 @@ def test_the_smoothing_conditional_is_the_dense_one(sequences, dense_joint, cond
             torch.testing.assert_close(exact.covariance[time], covariance)
 
 
-def test_the_smoothing_conditional_gives_every_path_the_same_weight(sequences):
+def test_the_smoothing_conditional_gives_paths_equal_weight(sequences):
     """p(s, o) / q(s) = p(o) for whatever s, where q is the posterior: the variance of the weight is zero."""
     observation, drive = sequences
     system = random_system(starts=1)

@@ -39,7 +39,7 @@ def test_the_evidence_is_that_of_one_dense_gaussian(setting, initial):
 
 
 @pytest.mark.parametrize(("setting", "gap"), [(SETTINGS[0], 5.19), (SETTINGS[1], 32.6), (SETTINGS[2], 6.06)])
-def test_the_exact_filter_as_posterior_falls_short_by_the_known_gap(setting, gap):
+def test_the_exact_filter_as_posterior_has_the_known_gap(setting, gap):
     r"""E log p(o) - ELBO = E KL(∏ N(m_t, P_t) ‖ p(s | o)): zero by the paper's Theorem 1, which takes the filter for q.
 
     Both means are linear in the observations, so the expectation over them is a trace.

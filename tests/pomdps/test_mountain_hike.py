@@ -14,7 +14,7 @@ def draw(process, sequences, length, seed=0):
     return process.sample(sequences, length, torch.Generator().manual_seed(seed))
 
 
-def test_a_step_keeps_its_direction_and_is_at_most_five_hundredths_long():
+def test_a_step_keeps_its_direction_and_is_at_most_0_05_long():
     action = draw(MountainHike(), 200, 10).action[:, 1:]  # (200, 9, 2)
 
     step = step_of(action)
@@ -92,7 +92,7 @@ def test_the_exact_smoothing_conditional_weighs_every_path_alike():
     torch.testing.assert_close(joint - posterior, process.log_likelihood(observation, action), rtol=0, atol=1e-9)
 
 
-def test_from_several_starts_the_smoothing_conditional_is_not_gaussian():
+def test_with_several_starts_smoothing_is_not_gaussian():
     process = MountainHike("multi")
 
     assert process.exact_smoothing_conditional(*draw(process, 2, 3)[1:]) is None

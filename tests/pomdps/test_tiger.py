@@ -9,7 +9,7 @@ from forbes.pomdps.tiger import LISTEN
 
 
 @pytest.mark.parametrize("accuracy", [0.5, 0.85, 1.0])
-def test_the_belief_counts_what_was_heard_since_a_door_was_opened(accuracy):
+def test_the_belief_counts_sounds_since_the_last_opened_door(accuracy):
     _, observation, action = Tiger(accuracy).sample(60, 12, torch.Generator().manual_seed(0))
 
     exact = Tiger(accuracy).exact_filter(observation, action)

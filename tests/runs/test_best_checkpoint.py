@@ -71,7 +71,7 @@ def test_a_run_without_a_validation_has_no_best(tiny_config, tmp_path):
     assert not RunFolder(run).checkpoint.with_name("best.ckpt").exists()
 
 
-def test_the_best_of_an_agent_is_that_of_its_highest_return_and_can_be_measured(tmp_path):
+def test_the_best_agent_by_return_is_kept_and_can_be_measured(tmp_path):
     run = tmp_path / "run"
     assert fit("--config", write_config(tmp_path), "--run_dir", run) == 0
 
@@ -86,7 +86,7 @@ class Killed(BaseException):
     """Stands for SIGKILL, which no handler of errors sees."""
 
 
-def test_a_kill_never_leaves_a_last_checkpoint_that_is_better_than_the_best(tmp_path, monkeypatch):
+def test_after_a_kill_the_last_checkpoint_never_beats_the_best(tmp_path, monkeypatch):
     path = tmp_path / "last.ckpt"
     for update in (1, 2):
         checkpoint = {"global_step": update, "best": {"metric": "val/elbo", "value": -1.0, "update": update}}

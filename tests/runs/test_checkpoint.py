@@ -43,7 +43,7 @@ STEPS = [(torch, "save"), (os, "fsync"), (zipfile.ZipFile, "testzip"), (Path, "r
 
 
 @pytest.mark.parametrize(("owner", "name"), STEPS, ids=[name for _, name in STEPS])
-def test_a_kill_at_any_step_of_saving_leaves_the_old_checkpoint_whole(path, monkeypatch, owner, name):
+def test_a_kill_while_saving_leaves_the_old_checkpoint_whole(path, monkeypatch, owner, name):
     def kill(*args, **kwargs):
         raise Killed
 
@@ -58,7 +58,7 @@ def test_a_kill_at_any_step_of_saving_leaves_the_old_checkpoint_whole(path, monk
     assert {file.name for file in path.parent.iterdir()} == {"last.ckpt", "previous.ckpt"}
 
 
-def test_a_checkpoint_that_is_the_previous_one_too_leaves_no_third_name(path):
+def test_a_checkpoint_linked_as_previous_leaves_no_third_name(path):
     """A rename of one name of a file to another does nothing, and keeps both."""
     path.with_name("previous.ckpt").hardlink_to(path)  # as after a kill between the two renames
 
@@ -84,7 +84,7 @@ for i in itertools.count():
     assert read_checkpoint(path)["weight"][0] >= saved[-1]
 
 
-def test_a_full_disk_is_one_sentence_and_leaves_the_old_checkpoint(path, monkeypatch):
+def test_a_full_disk_leaves_the_old_checkpoint(path, monkeypatch):
     def full(descriptor):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -126,7 +126,7 @@ def directory_entries(content):
     return [match.start() for match in re.finditer(b"PK\x01\x02", content)]
 
 
-def test_a_flipped_bit_anywhere_in_the_file_never_gives_other_numbers(path):
+def test_a_flipped_bit_never_gives_other_numbers(path):
     """Bit 4 of byte 38 of a directory entry makes it a folder, of which torch reads zeros."""
     AtomicCheckpointIO().save_checkpoint({"state_dict": {"weight": torch.arange(1.0, 9.0)}}, path)
     path.with_name("previous.ckpt").unlink()
@@ -153,7 +153,7 @@ def test_a_folder_in_a_checkpoint_without_a_seal_is_refused(path):
         read_checkpoint(path)
 
 
-def test_a_damaged_checkpoint_falls_back_to_the_one_before_and_says_so(path, capsys):
+def test_a_damaged_checkpoint_falls_back_to_the_previous_one(path, capsys):
     AtomicCheckpointIO().save_checkpoint(NEW, path)
     path.write_bytes(path.read_bytes()[:-1] + b"?")
 
@@ -166,7 +166,7 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before_and_says_so(path, cap
     torch.testing.assert_close(read_checkpoint(path.with_name("previous.ckpt")), OLD)
 
 
-def test_the_checkpoint_before_is_kept_where_there_are_no_hard_links(path, monkeypatch):
+def test_the_previous_checkpoint_is_kept_without_hard_links(path, monkeypatch):
     def refused(*_):
         raise OSError(errno.EPERM, "Operation not permitted")
 
@@ -185,6 +185,6 @@ def test_a_checkpoint_that_would_run_code_is_refused(path, monkeypatch):
     monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")
     torch.save({"weight": Evil()}, path)
 
-    with pytest.raises(ForbesError, match=r"last\.ckpt: refused, it holds more than tensors"):
+    with pytest.raises(ForbesError, match=r"last\.ckpt: refused, it has other objects than tensors"):
         AtomicCheckpointIO().load_checkpoint(path, weights_only=False)
     assert not (path.parent / "evil").exists()

@@ -41,7 +41,7 @@ def test_two_epochs_and_two_more_are_four_epochs(straight, tiny_run, tmp_path):
     assert_same_run(run, straight)
 
 
-def test_a_run_whose_checkpoint_is_damaged_goes_on_from_the_one_before(straight, tiny_run, tmp_path, capsys):
+def test_a_run_resumes_from_the_last_undamaged_checkpoint(straight, tiny_run, tmp_path, capsys):
     run = RunFolder(shutil.copytree(tiny_run, tmp_path / "run"))
     run.checkpoint.write_bytes(run.checkpoint.read_bytes()[:-100])
 
@@ -89,7 +89,7 @@ def test_a_finished_run_says_so(tiny_run, tmp_path, capsys):
 
     assert main(["fit", "--resume", str(run)]) == 0
 
-    assert "nothing was trained: max_epochs 2 ends it at update 10. Give a higher limit" in capsys.readouterr().out
+    assert "nothing was trained: max_epochs 2 ends at update 10. Set a higher limit" in capsys.readouterr().out
     assert_same_run(run, tiny_run)
 
 
@@ -147,7 +147,7 @@ def test_a_signal_stops_a_training_where_it_can_go_on(
 
     assert status == 128 + number
     assert read_checkpoint(RunFolder(run).checkpoint)["global_step"] == stops_at
-    assert f"stopped at update {stops_at}, go on with: forbes fit --resume {run}" in capsys.readouterr().out
+    assert f"stopped at update {stops_at}, resume with: forbes fit --resume {run}" in capsys.readouterr().out
     assert main(["fit", "--resume", run]) == 0
     assert_same_run(run, straight)
 

@@ -22,7 +22,7 @@ def test_an_experiment_is_named_after_its_configuration(config, name):
     assert experiment_name([config, "configs/debug.yaml"]) == name
 
 
-def test_runs_that_start_in_the_same_second_have_folders_of_their_own(in_tmp_path):
+def test_runs_started_in_the_same_second_have_own_folders(in_tmp_path):
     folders = {RunFolder.new("strokes/forbes", "20260101-120000", seed=3).path for _ in range(3)}
 
     assert {folder.name for folder in folders} == {"20260101-120000-3", "20260101-120000-3-2", "20260101-120000-3-3"}
@@ -89,7 +89,7 @@ def test_metrics_are_a_row_an_update_and_a_column_a_name(tmp_path):
     assert table.loc[2, "val/elbo"] == -2.0
 
 
-def test_lines_after_the_checkpoint_a_run_went_on_from_are_dropped(tmp_path):
+def test_lines_after_the_resumed_checkpoint_are_dropped(tmp_path):
     log(tmp_path, first=0, last=5, value=1.0)
     log(tmp_path, first=3, last=4, value=2.0)
 
@@ -97,7 +97,7 @@ def test_lines_after_the_checkpoint_a_run_went_on_from_are_dropped(tmp_path):
 
 
 @pytest.mark.parametrize("cut", [1, 10, 30])
-def test_a_line_cut_short_by_a_kill_is_dropped_and_does_not_spoil_the_next(tmp_path, cut):
+def test_a_line_cut_short_by_a_kill_does_not_spoil_the_next(tmp_path, cut):
     log(tmp_path, first=0, last=3, value=1.0)
     content = (tmp_path / "metrics.jsonl").read_bytes()
     (tmp_path / "metrics.jsonl").write_bytes(content[:-cut])

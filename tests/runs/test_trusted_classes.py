@@ -188,7 +188,7 @@ def test_the_classes_of_lightning_are_named_as_before(argument, value):
     assert type(made).__name__ == spec["class_path"].rpartition(".")[2]
 
 
-def test_a_module_of_ones_own_gives_classes_and_functions_by_name(in_tmp_path, monkeypatch):
+def test_your_own_module_gives_classes_and_functions_by_name(in_tmp_path, monkeypatch):
     Path("of_mine.py").write_text(
         "from lightning import Callback\n"
         "class Part: ...\n"

@@ -143,7 +143,7 @@ def test_a_flow_that_is_the_identity_is_dreamer(trajectories):
 
 
 @pytest.mark.parametrize("belief", [GaussianBelief, partial(FlowBelief, layers=2, width=4)])
-def test_the_first_sample_is_the_path_the_filter_took_and_all_differ(belief):
+def test_the_first_sample_is_the_filtered_path_and_all_differ(belief):
     model, batch = agent(belief=belief).model, make_batch()
     filtered = model.filter(model.embed(batch.observation), batch.action)
 
@@ -159,7 +159,7 @@ def test_the_first_sample_is_the_path_the_filter_took_and_all_differ(belief):
 
 @pytest.mark.parametrize("entropy", [0.0, 0.3])
 @pytest.mark.parametrize("trajectories", [1, 3])
-def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy, trajectories):
+def test_imagined_rewards_and_values_match_their_states(entropy, trajectories):
     """The losses, spelled out along each trajectory, which has a beginning and actions of its own.
 
     The actor learns what each action leads to, not to reach states in which it would choose another: it sees constants.
@@ -193,7 +193,7 @@ def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy, t
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_the_reward_of_entropy_brings_an_actor_back_from_the_border(side):
+def test_entropy_reward_brings_an_actor_back_from_the_border(side):
     """Where mean and spread say +-1 without a doubt, what the action earns has no slope left."""
     ours, batch = agent(trajectories=1), make_batch()
     with torch.no_grad():
@@ -208,7 +208,7 @@ def test_the_reward_of_entropy_brings_an_actor_back_from_the_border(side):
     assert slope[1e-2] > 10 * abs(slope[0.0])
 
 
-def test_what_lies_on_padding_changes_nothing_of_the_control_losses():
+def test_padding_does_not_change_the_control_losses():
     ours, batch = agent(trajectories=2), make_batch()
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     batch.mask[:, 3:] = False
@@ -275,7 +275,7 @@ def one_of_two(batch, time, seed):
     return SequenceBatch(action.clone(), action, reward, mask, torch.zeros(batch, time, 0), ~mask)
 
 
-def test_an_agent_that_foresees_no_end_imagines_as_one_that_knows_of_none():
+def test_never_predicting_an_end_equals_having_no_prediction():
     ours, batch = agent(continuation=True), make_batch()
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     losses = []
@@ -287,7 +287,7 @@ def test_an_agent_that_foresees_no_end_imagines_as_one_that_knows_of_none():
     torch.testing.assert_close(losses[0], losses[1])
 
 
-def test_an_agent_that_foresees_the_end_at_once_is_paid_the_first_reward_only():
+def test_predicting_the_end_at_once_pays_only_the_first_reward():
     ours, batch = agent(continuation=True, trajectories=1), make_batch(1, 1)
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     saturate(ours.continues, -50.0)

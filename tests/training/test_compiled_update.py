@@ -71,7 +71,7 @@ def make_batch(kind):
 
 
 @pytest.mark.parametrize("kind", AGENTS)
-def test_the_losses_of_an_update_are_one_graph_with_the_same_gradients(kind):
+def test_update_losses_are_one_graph_with_the_same_gradients(kind):
     """A break of the graph is an error, by `fullgraph`."""
     agent, results = make_agent(kind), []
     compiled = torch.compile(lambda batch: agent.training_step(batch, 0), fullgraph=True, backend="eager")
@@ -111,6 +111,6 @@ def test_an_update_never_asks_for_the_value_of_a_tensor(kind):
         lambda x: x.unique(),
     ],
 )
-def test_who_asks_for_a_value_or_a_shape_that_depends_on_one_is_caught(ask):
+def test_asking_for_a_value_or_dependent_shape_is_caught(ask):
     with FakeTensorMode(), pytest.raises(RuntimeError):
         ask(torch.rand(3))

@@ -143,7 +143,7 @@ def test_the_loss_is_the_bound_with_the_options_asked_for(options, loss):
     assert recorder.rows[0]["loss"] == pytest.approx(expected.item())
 
 
-def test_the_logged_bound_knows_no_free_nats_weights_or_closed_forms():
+def test_logged_bound_has_no_free_nats_weights_or_closed_forms():
     options = {"belief": GaussianBelief, "free_nats": 9.0, "kl_warmup": 10}
     _, recorder = fit(make_world_model(**options), updates=1)
 
@@ -184,7 +184,7 @@ def mean_frame(batch):
     return batch.observation[batch.mask].double().mean(0).float() - 0.5  # (*O)
 
 
-def test_a_centered_model_is_the_plain_model_of_what_differs_from_the_mean_frame():
+def test_a_centered_model_is_a_plain_one_of_centered_frames():
     """The density of a Gaussian moves with its mean; the first layer's bias takes up what the encoder is not shown."""
     options, batch = {"likelihood": Normal(scale=1)}, make_batch()
     centered, plain = make_world_model(**options, center=True), make_world_model(**options)
@@ -260,7 +260,7 @@ def test_noise_depends_on_seed_and_update_only():
     assert len(set(first)) == 3
 
 
-def test_validation_has_the_same_noise_each_time_and_weighs_sequences_equally():
+def test_validation_has_fixed_noise_and_equal_sequence_weights():
     trainer, _ = fit(make_world_model(learning_rate=0.0), updates=1)
     name, model = f"val/{BOUND}", trainer.lightning_module
     in_training = trainer.callback_metrics[name].item()
@@ -285,7 +285,7 @@ def test_test_and_prediction_give_the_bound_of_each_sequence():
     assert [elbo.shape for elbo in predicted] == [(BATCH,), (1,)]
 
 
-def test_gradients_are_scaled_to_the_clip_norm_and_the_norm_before_is_logged():
+def test_gradients_are_clipped_and_the_norm_before_is_logged():
     free, clipped = (fit(make_world_model(clip_norm=norm), updates=1)[1].rows[0] for norm in (1e6, 0.1))
 
     assert free["used_norm"] > 0.1

@@ -1,1 +1,1 @@
-"""The arguments of every command, one file each: nothing heavy is imported, so that help comes at once."""
+"""The arguments of every command, one file each. Nothing heavy is imported, so that `--help` is fast."""

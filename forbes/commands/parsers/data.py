@@ -1,4 +1,4 @@
-"""`forbes data …`: the arguments of its commands, and where each of them is."""
+"""The arguments of `forbes data …`, and the functions that run its commands."""
 
 import argparse
 import importlib
@@ -12,11 +12,11 @@ from forbes.envs.tasks import TASKS
 
 __all__ = ["main", "parser"]
 
-_STORED = "folder of the episodes"
+_STORED = "folder of the episode store"
 
 
 def main(argv: Sequence[str]) -> int | None:
-    """Run `forbes data …`; 1 where `check` has found damage."""
+    """Run `forbes data …`. Return 1 if `check` found damage."""
     arguments = vars(parser().parse_args(argv))
     module, function = arguments.pop("command").split(":")
     command: Callable[..., int | None] = getattr(importlib.import_module(module), function)
@@ -24,7 +24,7 @@ def main(argv: Sequence[str]) -> int | None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of `forbes data`; `command` of what it parses is `module:function`."""
+    """Return the parser of `forbes data`. It sets `command` to the `module:function` to run."""
     of_data = _Parser()
     _add_strokes(of_data)
     _add_collect(of_data)
@@ -33,14 +33,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 class _Parser(ArgumentParser):
-    """Has a command under each of its names."""
+    """A parser with subcommands and an example for each."""
 
     def __init__(self) -> None:
-        super().__init__("forbes data", "Build, fetch, compare, collect and look at the data.", "examples:")
+        super().__init__("forbes data", "Build, fetch, compare, collect and show data.", "examples:")
         self._commands = self.add_subparsers(required=True, metavar="COMMAND", parser_class=ArgumentParser)
 
     def add(self, name: str, target: str, summary: str, example: str) -> argparse.ArgumentParser:
-        """Add a command and its example."""
+        """Add a subcommand and its example."""
         epilog = f"example: forbes data {example}"
         command = self._commands.add_parser(name, help=summary, description=summary, epilog=epilog)
         command.set_defaults(command=target)
@@ -49,28 +49,28 @@ class _Parser(ArgumentParser):
 
 
 def _add_strokes(of_data: _Parser) -> None:
-    summary = "Extract the pen paths of all MNIST digits from their images, bit for bit as in the bundled set."
+    summary = "Extract the pen paths of all MNIST digits from their images, bit-identical to the bundled set."
     example = "build-strokes --images package/data"
     build = of_data.add("build-strokes", "forbes.commands.data:build_strokes", summary, example)
     build.add_argument("--images", type=Path, required=True, help="folder with the four IDX files of MNIST, unpacked")
-    build.add_argument("-o", "--output", type=Path, help="file to write, by default the bundled one")
+    build.add_argument("-o", "--output", type=Path, help="file to write (default: the bundled one)")
 
-    summary = "Train the digit classifiers on both sets of strokes, and say how good they are on test digits."
+    summary = "Train the digit classifiers on both sets of strokes, and print their scores on test digits."
     example = "build-classifiers -o classifiers.npz"
     train = of_data.add("build-classifiers", "forbes.commands.data:build_classifiers", summary, example)
-    train.add_argument("-o", "--output", type=Path, help="file to write, by default the bundled one")
+    train.add_argument("-o", "--output", type=Path, help="file to write (default: the bundled one)")
 
-    summary = "Store what does not come with the package, verified by its hashes."
+    summary = "Download a data set that is not bundled, verify its hash, and store it."
     get = of_data.add("fetch", "forbes.commands.data:fetch", summary, "fetch strokes --from sequences.tar.gz")
-    get.add_argument("dataset", choices=get_args(Fetched), help="strokes of the paper, or Dreamer's learning curves")
-    of_strokes = "of strokes the tarball, its extracted folder or an .npz"
-    get.add_argument("--from", dest="from_", type=Path, metavar="PATH", help=f"a local copy; {of_strokes}")
+    get.add_argument("dataset", choices=get_args(Fetched), help="the paper's strokes, or Dreamer's learning curves")
+    of_strokes = "for strokes the tarball, its extracted folder or an .npz"
+    get.add_argument("--from", dest="from_", type=Path, metavar="PATH", help=f"local copy to use; {of_strokes}")
 
-    summary = "Print how alike two stroke files of the same digits are."
+    summary = "Print measures of similarity of two stroke files of the same digits."
     example = "compare-strokes data/strokes.npz dejong-strokes.npz"
     compare = of_data.add("compare-strokes", "forbes.commands.data:compare_strokes", summary, example)
-    compare.add_argument("one", type=Path, help="a stroke file")
-    compare.add_argument("other", type=Path, help="another one, of the same digits")
+    compare.add_argument("one", type=Path, help="first stroke file")
+    compare.add_argument("other", type=Path, help="second stroke file, of the same digits")
     compare.add_argument("--split", choices=("train", "test"), default="test", help="digits to compare (default: test)")
 
     summary = "Draw digits as they are written: frames coloured from the first point to the last, and the strokes."
@@ -79,67 +79,72 @@ def _add_strokes(of_data: _Parser) -> None:
     look.add_argument("dataset", choices=get_args(Dataset))
     look.add_argument("--split", choices=get_args(Split), default="test", help="split of the digits (default: test)")
     look.add_argument(
-        "--index", type=int, nargs="+", default=[0, 1, 2], help="numbers of the digits in their split (default: 0 1 2)"
+        "--index", type=int, nargs="+", default=[0, 1, 2], help="indices of the digits in their split (default: 0 1 2)"
     )
     look.add_argument(
-        "-o", "--output", type=Path, default=Path("strokes.png"), help="picture to write (default: strokes.png)"
+        "-o", "--output", type=Path, default=Path("strokes.png"), help="image file to write (default: strokes.png)"
     )
     look.add_argument("--origin", choices=get_args(Origin), default="bundled", help="set of strokes (default: bundled)")
-    look.add_argument("--path", type=Path, help="read this stroke file instead of the origin's own")
+    look.add_argument("--path", type=Path, help="stroke file to read instead of the origin's")
 
 
 def _add_collect(of_data: _Parser) -> None:
-    summary = "Play episodes in a process of its own, and store them; interrupted, it goes on where it stopped."
+    summary = "Play episodes in a separate process and store them. If interrupted, the same command resumes."
     example = "collect --task cartpole_swingup --episodes 40 -o episodes/cartpole"
     play = of_data.add("collect", "forbes.commands.collect:collect", summary, example)
     play.epilog = (
         f"tasks:\n{TASKS}\n\n{play.epilog}\n"
         "         forbes data collect --policy RUN --episodes 80 -o episodes/cartpole    # 40 more, by an agent"
     )
-    play.add_argument("--task", help="see below; an agent has its own")
-    play.add_argument("--episodes", type=positive, default=10, help="how many DIR has had in the end (default: 10)")
+    play.add_argument("--task", help="task, one of those below; not with the agent of a run")
+    play.add_argument(
+        "--episodes",
+        type=positive,
+        default=10,
+        help="number of episodes in DIR at the end, including earlier ones (default: 10)",
+    )
     play.add_argument(
         "--policy",
         default="random",
         metavar="random|RUN",
-        help="who acts: a run's agent explores (default: random)",
+        help="random policy, or the agent of a run, which explores (default: random)",
     )
     play.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help=_STORED)
     play.add_argument("--seed", type=int, default=0, help="episode n is a function of the seed and n (default: 0)")
     play.add_argument(
         "--action-repeat",
         type=positive,
-        help="steps for which an action is held (default: 2 in DeepMind Control, 1 in Gymnasium)",
+        help="number of steps that each action is repeated (default: 2 in DeepMind Control, 1 in Gymnasium)",
     )
     play.add_argument(
         "--pixels",
         action=argparse.BooleanOptionalAction,
-        help="observe images that are drawn, or what is measured (default: images in DeepMind Control only)",
+        help="observe rendered images instead of measurements (default: images in DeepMind Control only)",
     )
     play.add_argument(
         "--size",
         type=positive,
-        help="pixels a side of images (default: 64 of those that are drawn, else the environment's own)",
+        help="side of the images in pixels (default: 64 if they are rendered, else the environment's own)",
     )
-    play.add_argument("--part", help="in Gymnasium: the entry of a Dict that is observed (default: all of them)")
+    play.add_argument("--part", help="in Gymnasium: entry of a Dict observation to use (default: all of them)")
     play.add_argument(
-        "--camera", type=int, help="in DeepMind Control: number of the camera (default: 0, 2 of quadruped)"
+        "--camera", type=int, help="in DeepMind Control: index of the camera (default: 0, for quadruped 2)"
     )
     play.add_argument(
-        "--fast", action="store_const", const=True, help="in DeepMind Control: no shadows, hence other pixels"
+        "--fast", action="store_const", const=True, help="in DeepMind Control: no shadows, which changes the pixels"
     )
     play.add_argument(
         "--time-limit", type=positive, metavar="STEPS", help="truncate longer episodes (default: 100,000)"
     )
-    play.add_argument("--timeout", type=seconds, help="seconds for an answer of the environment (default: 60)")
+    play.add_argument("--timeout", type=seconds, help="seconds to wait for the environment (default: 60)")
 
 
 def _add_episodes(of_data: _Parser) -> None:
-    summary = "Print what a store of episodes holds, and draw the frames of three of them."
+    summary = "Print a summary of an episode store, and draw frames of three episodes."
     look = of_data.add("info", "forbes.commands.episodes:info", summary, "info episodes/cartpole")
     look.add_argument("path", type=Path, metavar="DIR", help=_STORED)
-    look.add_argument("-o", "--output", type=Path, help="picture to write, by default DIR/frames.png")
+    look.add_argument("-o", "--output", type=Path, help="image file to write (default: DIR/frames.png)")
 
-    summary = "Verify every file of a store of episodes, and put damaged ones aside; 1 if there were any."
+    summary = "Verify every file of an episode store, move damaged ones to quarantine/; exit status 1 if there are any."
     verify = of_data.add("check", "forbes.commands.episodes:check", summary, "check episodes/cartpole")
     verify.add_argument("path", type=Path, metavar="DIR", help=_STORED)

@@ -7,4 +7,6 @@ __all__ = ["parser"]
 
 def parser() -> ArgumentParser:
     """Return the parser of `forbes doctor`."""
-    return ArgumentParser("forbes doctor", "Say what this machine has and lacks, each lack with its remedy.")
+    return ArgumentParser(
+        "forbes doctor", "Report this machine's software, hardware and data, with a remedy for each problem."
+    )

@@ -11,92 +11,99 @@ __all__ = ["add_acting_samples", "add_output", "add_score_options", "parser"]
 
 
 _DESCRIPTION = f"""\
-Measure trained models by bounds and proper scores, and compare them on the same sequences.
+Evaluate trained models by likelihood bounds and proper scores, and compare them on the same sequences.
 
   forbes evaluate runs/compare/forbes-0 runs/compare/rssm-0
   forbes evaluate runs/compare/forbes-0 --scores elbo pll --sequences 200
   forbes evaluate runs/agent/forbes-0 runs/agent/dreamer-0 --episodes 20
 
-Nats per sequence of observations, fully normalised, without free nats; the KL is the Monte-Carlo estimate for every
-family; mean and standard error over sequences. An ELBO alone does not tell a good belief: it prefers one that is too
-certain. So beside it:
+Scores are nats per sequence of observations, fully normalised, without free nats, as mean and standard error over
+sequences. The KL is the Monte-Carlo estimate for every family. The ELBO alone does not identify a good belief, since
+it prefers beliefs that are too certain. So there are several scores:
 
-  elbo       the bound and its parts, S trajectories, on the whole split
-  pll        log p(o_t | o_1..t-1) summed over t, by K particles of the belief: the proper score of the filtering
-             belief. The posterior helps to estimate it, without bias. And the IWAE bound, by the same trajectories
-  fivo       the sequential Monte-Carlo bound, by K particles, and their effective sample size
-  open-loop  log p(rest | beginning), by K futures that start in the belief; with pll, the degradation: how much a
-             prediction loses with each step that it has not seen
+  elbo       the bound and its parts, with S trajectories, on the whole split
+  pll        log p(o_t | o_1..t-1) summed over t, with K particles of the belief: the proper score of the filtering
+             belief, estimated with the help of the posterior; also the IWAE bound of the same trajectories
+  fivo       the sequential Monte-Carlo bound with K particles, and their effective sample size
+  open-loop  log p(rest | beginning), with K futures that start from the belief; together with pll also the
+             degradation, the nats that a prediction loses with each step without an observation
 
-Data of a known process add log_p, the exact log p(o_1..T), which no bound exceeds. A VectorModel has no bounds, since
-its likelihood is exact, and pll gives it; pll and open-loop of a ParticleModel are those of its own sets of particles.
+For data of a known process there is also log_p, the exact log p(o_1..T), which no bound exceeds. A VectorModel has no
+bounds: its likelihood is exact, and is reported as pll. A ParticleModel uses its own particles for pll and open-loop.
 
-pll, fivo and open-loop take the first {SUBSET} sequences, and their names say so. Writes evaluation.json, and
-evaluation.npz with each sequence's scores, into each run folder. Interrupted, the same command goes on where it
-stopped.
+pll, fivo and open-loop score the first {SUBSET} sequences, as the names of the metrics show. Writes evaluation.json,
+and evaluation.npz with the scores of each sequence, to each run folder. If interrupted, the same command resumes where
+it stopped.
 
-Agents play --episodes without exploration, the same ones for all, whatever each is shown; their score is the return.
-Beside it stands what share of the rewards' variance in these episodes the world model foretells, from its belief and 1,
-5 and 15 steps ahead by the actions taken: 1 is perfect, 0 no better than the mean reward, as of a model that knows its
-own episodes by heart, or where rewards hardly vary; then how far prior and posterior are from the nearest Gaussian, 0
-where the family makes no difference; and, of a process whose exact belief is known, how unsure the agent's belief is of
-the reward, as a share of the exact one's variance: near 0 where its draws all say the same. All is kept as each agent
-ends; interrupted, all play again.
+Agents play the same --episodes without exploration; their score is the return. In these episodes are also measured:
+- R² of the rewards predicted from the belief, for the current step and 1, 5 and 15 steps ahead (1 = perfect, 0 = no
+  better than the mean reward, e.g. an overfitted model or nearly constant rewards);
+- the KL of prior and posterior from the nearest Gaussian (near 0 = a Gaussian would do as well);
+- if the exact belief is known, the variance of the reward under the agent's belief divided by that under the exact one
+  (near 0 = all belief samples agree).
+Results are saved per agent; an interrupted evaluation starts over.
 
-With --acting-samples 32 an agent takes the mean action of 32 trajectories of its belief (of discrete actions the
-commonest), not that of one, which is the paper's: no training is needed for it, and where an observation tells little
-it can be worth much, or cost as much.
+With --acting-samples 32 an agent takes the mean action (discrete: the most frequent) of 32 belief samples instead of
+one, as in the paper. This needs no training. If observations are uninformative, it can raise or lower the return a lot.
 
-On digit strokes and one core, elbo takes some 4 minutes a run, pll 5, fivo 3, and open-loop 20, in proportion to
---futures and --sequences. Beside each score stands what models without a belief have on the same sequences, of
-strokes 1- to 5-grams of pen moves, of images the last frame and the mean frame; a run below one of them is marked."""
+On digit strokes and one core, elbo takes about 4 minutes per run, pll 5, fivo 3, and open-loop 20, in proportion to
+--futures and --sequences. Each score is compared with models without a belief on the same sequences: 1- to 5-grams of
+pen moves for strokes, the last frame and the mean frame for images. Runs below one of them are marked."""
 
 
 def parser() -> ArgumentParser:
     """Return the parser of `forbes evaluate`."""
     command = ArgumentParser("forbes evaluate", _DESCRIPTION)
     command.add_argument(
-        "runs", nargs="+", metavar="RUN", help="run folder that `forbes fit` has made, or a checkpoint in it"
+        "runs", nargs="+", metavar="RUN", help="run folder written by `forbes fit`, or a checkpoint in it"
     )
-    command.add_argument("--checkpoint", metavar="NAME", help="another than last.ckpt, in checkpoints/ of every RUN")
+    command.add_argument(
+        "--checkpoint", metavar="NAME", help="checkpoint in checkpoints/ of every RUN (default: last.ckpt)"
+    )
     add_output(command)
-    command.add_argument("--episodes", type=positive, default=10, help="that an agent plays (default: 10)")
+    command.add_argument("--episodes", type=positive, default=10, help="number of episodes per agent (default: 10)")
     add_acting_samples(command)
     add_score_options(command)
     return command
 
 
 def add_output(parser: argparse.ArgumentParser) -> None:
-    """Add what says where results go."""
-    parser.add_argument("--output", metavar="DIR", help="results go to DIR/NAME-OF-RUN, not into the run folders")
+    """Add the option for the folder of the results."""
+    parser.add_argument("--output", metavar="DIR", help="write results to DIR/NAME-OF-RUN instead of the run folders")
 
 
 def add_acting_samples(parser: argparse.ArgumentParser) -> None:
-    """Add what says how an agent acts on its belief."""
+    """Add the option for the number of belief samples that an agent acts on."""
     parser.add_argument(
         "--acting-samples",
         type=positive,
         metavar="K",
-        help="trajectories of its belief whose mean action an agent takes (default: as it was trained, 1 in the paper)",
+        help="number of belief samples whose mean action an agent takes (default: as trained, 1 in the paper)",
     )
 
 
 def add_score_options(parser: argparse._ActionsContainer) -> None:
-    """Add what says how runs are measured."""
-    parser.add_argument("--scores", nargs="+", choices=PASSES, default=PASSES, help="default: all")
+    """Add the options of the scores."""
+    parser.add_argument("--scores", nargs="+", choices=PASSES, default=PASSES, help="scores to compute (default: all)")
     parser.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
     parser.add_argument(
         *("--sequences", "--digits"),
         type=_all_or_number,
         default=None,
-        help=f"all, or only the first so many, for every score (default: all for elbo, {SUBSET} for the others)",
+        help=f"all, or the number of sequences for every score (default: all for elbo, {SUBSET} for the others)",
     )
-    parser.add_argument("--samples", type=positive, default=16, help="S of the ELBO (default: 16)")
-    parser.add_argument("--particles", type=positive, default=128, help="K of PLL, IWAE and FIVO (default: 128)")
-    parser.add_argument("--futures", type=positive, default=1000, help="K of the open-loop score (default: 1000)")
-    parser.add_argument("--context", type=positive, default=15, help="steps seen by the open-loop score (default: 15)")
-    parser.add_argument("--batch-size", type=positive, default=250, help="sequences at a time (default: 250)")
-    parser.add_argument("--seed", type=int, default=0, help="of the noise (default: 0)")
+    parser.add_argument("--samples", type=positive, default=16, help="trajectories of the ELBO, S (default: 16)")
+    parser.add_argument(
+        "--particles", type=positive, default=128, help="particles of PLL, IWAE and FIVO, K (default: 128)"
+    )
+    parser.add_argument(
+        "--futures", type=positive, default=1000, help="futures of the open-loop score, K (default: 1000)"
+    )
+    parser.add_argument(
+        "--context", type=positive, default=15, help="steps that the model sees in the open-loop score (default: 15)"
+    )
+    parser.add_argument("--batch-size", type=positive, default=250, help="sequences per batch (default: 250)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed for the noise (default: 0)")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1 … (default: auto)")
 
 

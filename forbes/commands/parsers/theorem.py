@@ -7,30 +7,37 @@ from forbes.commands.arguments import ArgumentParser, positive
 
 __all__ = ["parser"]
 
-_STEPS = 200  # powers of F stay in the range of float64, and so do the matrices in memory
+_STEPS = 200  # keeps powers of F in the range of float64, and the matrices in memory
 
 _DESCRIPTION = """\
-Check Theorem 1 where everything is known, and show that a higher ELBO is not a better belief.
+Check Theorem 1 in closed form, and show that a higher ELBO does not mean a better belief.
 
   forbes theorem
   forbes theorem --transition 0.9 --process-noise 0.3 --observation-noise 0.5 --steps 30
 
-The process is s_1 ~ N(0, 1), s_t = F s_t-1 + N(0, Q), o_t = s_t + N(0, R). Without F, Q and R: three of them. All
-numbers are means over observations of the process, in closed form but for the column Monte Carlo. log p - ELBO and
-log p - PLL are 0 at best; PLL, the prequential log-likelihood, scores each belief by the next observation."""
+The process is s_1 ~ N(0, 1), s_t = F s_t-1 + N(0, Q), o_t = s_t + N(0, R). Without F, Q and R, three processes are
+used. All values are means over observations of the process, in closed form except in the column Monte Carlo.
+log p - ELBO and log p - PLL are 0 at best; PLL, the prequential log-likelihood, scores each belief by the next
+observation."""
 
 
 def parser() -> ArgumentParser:
     """Return the parser of `forbes theorem`."""
     command = ArgumentParser("forbes theorem", _DESCRIPTION)
     command.add_argument(
-        "--transition", type=_finite, metavar="F", help="default: 1; with 0 all four beliefs are exact"
+        "--transition", type=_finite, metavar="F", help="with 0 all four beliefs are exact (default: 1)"
     )
-    command.add_argument("--process-noise", type=_variance, metavar="Q", help="a variance; default: 1")
-    command.add_argument("--observation-noise", type=_variance, metavar="R", help="a variance; default: 1")
-    command.add_argument("--steps", type=_steps, default=15, metavar="T", help=f"at most {_STEPS} (default: 15)")
-    command.add_argument("--samples", type=_several, default=20_000, metavar="N", help="Monte Carlo (default: 20000)")
-    command.add_argument("--seed", type=int, default=0, help="of the samples (default: 0)")
+    command.add_argument("--process-noise", type=_variance, metavar="Q", help="variance of the process (default: 1)")
+    command.add_argument(
+        "--observation-noise", type=_variance, metavar="R", help="variance of the observations (default: 1)"
+    )
+    command.add_argument(
+        "--steps", type=_steps, default=15, metavar="T", help=f"number of steps, at most {_STEPS} (default: 15)"
+    )
+    command.add_argument(
+        "--samples", type=_several, default=20_000, metavar="N", help="Monte-Carlo samples (default: 20000)"
+    )
+    command.add_argument("--seed", type=int, default=0, help="random seed for the samples (default: 0)")
     return command
 
 

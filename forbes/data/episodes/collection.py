@@ -1,4 +1,4 @@
-"""Playing episodes: an environment, a policy and a seed become an `Episode`."""
+"""Play episodes: an environment, a policy and a seed determine an `Episode`."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -15,8 +15,8 @@ from forbes.seeding import derive_seed
 
 __all__ = [
     "ATTEMPTS",
+    "EpisodePolicy",
     "MakePolicy",
-    "Policy",
     "collect_episodes",
     "describe_environment",
     "episode_seed",
@@ -25,29 +25,29 @@ __all__ = [
     "random_policy",
 ]
 
-Policy: TypeAlias = Callable[[NDArray[Any]], NDArray[np.float32]]
-"""Chooses a_t, float32 `(A,)`, when it is shown o_t; it lives for one episode, so it may remember."""
-MakePolicy: TypeAlias = Callable[[Environment, int], Policy]
-"""Makes the policy of an episode from the environment's numbers and a seed."""
+EpisodePolicy: TypeAlias = Callable[[NDArray[Any]], NDArray[np.float32]]
+"""Function that chooses a_t, float32 `(A,)`, given o_t. It is used for one episode only and may have a memory."""
+MakePolicy: TypeAlias = Callable[[Environment, int], EpisodePolicy]
+"""Function that makes the policy of an episode from the environment and a random seed."""
 
 ATTEMPTS = 3
-"""How often an episode is begun before it is given up."""
+"""Maximal number of attempts to play an episode."""
 
 
-def random_policy(environment: Environment, seed: int) -> Policy:
-    """Make a policy that draws each action alike, independent of all else: uniform in [-1, 1]^A, or one of A."""
+def random_policy(environment: Environment, seed: int) -> EpisodePolicy:
+    """Make a policy with independent uniform actions, in [-1, 1]^A or one-hot."""
     random, count = np.random.default_rng(seed), environment.action_dim
     if environment.discrete:
         return lambda _: np.eye(count, dtype=np.float32)[random.integers(count)]
     return lambda _: random.uniform(-1, 1, count).astype(np.float32)
 
 
-def play(environment: Environment, policy: Policy, seed: int) -> Episode:
-    """Play one episode from its reset to its end; whatever goes wrong, nothing is left of it.
+def play(environment: Environment, policy: EpisodePolicy, seed: int) -> Episode:
+    """Play one episode from its reset to its end.
 
     Raises:
-        BrokenEnvironmentError: where a process that owns the environment has failed.
-        ForbesError: where the policy gives what is no action.
+        BrokenEnvironmentError: if the process of the environment fails.
+        ForbesError: if the policy returns an invalid action.
     """
     step = environment.reset(seed)
     steps: list[Step] = [step]
@@ -57,74 +57,87 @@ def play(environment: Environment, policy: Policy, seed: int) -> Episode:
         if action.shape != actions[0].shape or not np.isfinite(action).all():
             raise ForbesError(
                 f"{environment.describe()['task']}: the policy's action at step {len(steps) - 1} is {action}, "
-                f"expected {environment.action_dim} finite numbers. Mend the policy"
+                f"expected {environment.action_dim} finite numbers. Fix the policy"
             )
         step = environment.step(action)
         steps.append(step)
         actions.append(action)
     return Episode(
-        observation=np.stack([each.observation for each in steps]),  # (T + 1, ...)
+        observation=np.stack([step.observation for step in steps]),  # (T + 1, ...)
         action=np.stack(actions),  # (T + 1, A)
-        reward=np.array([0.0, *(each.reward for each in steps[1:])], np.float32),  # (T + 1,)
+        reward=np.array([0.0, *(step.reward for step in steps[1:])], np.float32),  # (T + 1,)
         terminated=step.terminated,
-        frames=sum(each.frames for each in steps[1:]),
+        frames=sum(step.frames for step in steps[1:]),
     )
 
 
 def collect_episodes(
     environment: Environment, writer: EpisodeWriter, make_policy: MakePolicy, policy: str, until: int, seed: int
 ) -> Iterator[EpisodeRecord]:
-    """Play and store episodes until the store has had so many; episode n depends on (seed, n) and the policy only.
+    """Play and store episodes up to number `until`. Episode n depends only on (seed, n) and the policy.
 
-    An episode that breaks is dropped, and played again from its seed in an environment started anew: what is stored
-    does not depend on it.
+    An episode that fails is dropped and replayed from its seed in a restarted environment, so failures do not change
+    what is stored.
 
     Args:
-        environment: an `EnvironmentProcess`, if a failure is to be survived.
-        writer: of the store.
-        make_policy: makes the policy of an episode.
-        policy: its name, for the record.
-        until: the watermark to reach.
-        seed: of the episodes and their policies.
+        environment: environment to play in; an `EnvironmentProcess` can be restarted after a failure.
+        writer: episode store to write to.
+        make_policy: function that makes the policy of an episode.
+        policy: name of the policy, for the record.
+        until: number of episodes that the store shall have had, its watermark.
+        seed: random seed for the episodes and their policies.
 
     Yields:
-        The record of each episode when it is safe on the disk.
+        Record of each episode, once it is safely stored.
 
     Raises:
-        ForbesError: where an episode breaks three times, or cannot be stored.
+        ForbesError: if an episode fails three times, or cannot be stored.
     """
     for number in range(writer.watermark, until):
-        chance = episode_seed(seed, number)
-        episode = play_whole(environment, make_policy, chance, number)
-        yield writer.append(episode, chance, policy, describe_environment(environment))
+        seed_of_episode = episode_seed(seed, number)
+        episode = play_whole(environment, make_policy, seed_of_episode, number)
+        yield writer.append(episode, seed_of_episode, policy, describe_environment(environment))
 
 
 def episode_seed(seed: int, number: int, purpose: str = "episode") -> int:
-    """Return the seed of an episode and its policy; `purpose` keeps those that measure apart from those collected."""
-    return derive_seed(seed, purpose, number) % 2**32  # what numpy's older generators take
+    """Return the seed of an episode and its policy.
+
+    Args:
+        seed: random seed of the run.
+        number: number of the episode.
+        purpose: name mixed into the seed, so that e.g. test episodes differ from training episodes.
+    """
+    return derive_seed(seed, purpose, number) % 2**32  # the range of numpy's legacy generators
 
 
 def play_whole(
     environment: Environment, make_policy: MakePolicy, seed: int, number: int, attempts: int = ATTEMPTS
 ) -> Episode:
-    """Play an episode, and play it again where it breaks; `seed` and `number` are the episode's own.
+    """Play an episode, and replay it if the environment fails.
+
+    Args:
+        environment: environment to play in.
+        make_policy: function that makes the policy of the episode.
+        seed: seed of this episode, from `episode_seed`.
+        number: number of the episode, for messages.
+        attempts: maximal number of attempts.
 
     Raises:
-        ForbesError: where it breaks three times.
+        ForbesError: if all attempts fail.
     """
     try:
         return play(environment, make_policy(environment, seed), seed)
     except BrokenEnvironmentError as failure:
         if attempts == 1:
             raise ForbesError(
-                f"{failure}; so broke episode {number} {ATTEMPTS} times, nothing of it is stored. Mend the environment"
+                f"{failure}; episode {number} failed {ATTEMPTS} times and was not stored. Fix the environment"
             ) from failure
-        print(f"forbes: {failure}; episode {number} is dropped and played again", file=sys.stderr)
+        print(f"forbes: {failure}; episode {number} is dropped and replayed", file=sys.stderr)
     return play_whole(environment, make_policy, seed, number, attempts - 1)
 
 
 def describe_environment(environment: Environment) -> dict[str, Any]:
-    """Return all that the record of an episode says of its environment."""
+    """Return the description of an environment for the record of an episode."""
     return environment.describe() | {
         "observation_shape": list(environment.observation_shape),
         "action_dim": environment.action_dim,

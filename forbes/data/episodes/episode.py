@@ -1,7 +1,7 @@
-"""An episode and its file: an uncompressed `.npz`, which any tool opens with `numpy.load`, and which is mapped here.
+"""An episode and its file: an uncompressed `.npz`, readable by `numpy.load`, and memory-mapped here.
 
-A member of an uncompressed archive is an array's bytes at some offset, so a window is read by touching its pages: the
-archive is neither copied nor unpacked, and what was read is the system's to forget.
+A member of an uncompressed archive is the bytes of an array at some offset. Reading a segment touches only its pages:
+the archive is neither copied nor unpacked, and the system may evict the pages again.
 """
 
 import hashlib
@@ -27,15 +27,15 @@ __all__ = ["DamagedEpisodeError", "Episode", "EpisodeRecord", "map_episode", "pa
 __all__ += ["problem_of", "problem_with", "read_record"]
 
 _ARRAYS = ("observation", "action", "reward")
-_SHOWN = 60  # characters of a wrong value
+_SHOWN = 60  # characters of an invalid value in an error message
 _LOCAL_HEADER = 30  # bytes before the name of a member of a zip archive
 
 
 @printed_by_shape
 class Episode(NamedTuple):
-    """T actions and T + 1 observations. Index t holds (o_t, a_{t-1}, r_t): the action that led there, 0 at the start.
+    """T actions and T + 1 observations. Index t has (o_t, a_{t-1}, r_t): the action that led to o_t, 0 at the start.
 
-    An episode of three observations, where a1 leads from o1 to o2 and is rewarded by r2::
+    An episode of three observations, in which a1 leads from o1 to o2 and earns r2::
 
         observation  o1  o2  o3
         action       0   a1  a2
@@ -43,19 +43,19 @@ class Episode(NamedTuple):
     """
 
     observation: NDArray[Any]
-    """uint8 `(T + 1, C, H, W)` or float32 `(T + 1, O)`."""
+    """o_t, uint8 `(T + 1, C, H, W)` or float32 `(T + 1, O)`."""
     action: NDArray[np.float32]
-    """`(T + 1, A)`, in [-1, 1] or one-hot."""
+    """a_{t-1}, `(T + 1, A)`, in [-1, 1] or one-hot."""
     reward: NDArray[np.float32]
-    """`(T + 1,)`."""
+    """r_t, `(T + 1,)`."""
     terminated: bool
-    """Whether the process has ended; else a time limit has cut it."""
+    """Whether the process terminated; False if a time limit truncated it."""
     frames: int
-    """Frames of the simulator, action repeat included: env steps."""
+    """Number of env steps: frames of the simulator, including action repeat."""
 
     @property
     def total_reward(self) -> float:
-        """The return: the sum of all rewards, without discount."""
+        """Undiscounted return, the sum of all rewards."""
         return float(self.reward.sum(dtype="float64"))
 
 
@@ -66,13 +66,13 @@ _FITS: dict[Any, Callable[[Any], bool]] = {
     str: lambda value: type(value) is str,
     dict[str, Any]: lambda value: type(value) is dict,
 }
-_SAID: dict[str, Callable[[Any], bool]] = {
+_ENVIRONMENT: dict[str, Callable[[Any], bool]] = {
     "task": _FITS[str],
     "observation_shape": lambda value: type(value) is list and len(value) in (1, 3) and all(map(_is_size, value)),
     "action_dim": lambda value: _is_size(value),
     "discrete": _FITS[bool],
 }
-"""What a record must say of its environment, for those who draw from the episodes."""
+"""Required fields of a record's environment, with a check of their values."""
 
 
 def _is_size(value: Any) -> bool:
@@ -80,28 +80,29 @@ def _is_size(value: Any) -> bool:
 
 
 class EpisodeRecord(NamedTuple):
-    """What the index says of an episode; a line of `index.jsonl`."""
+    """The entry of an episode in the index, a line of `index.jsonl`."""
 
     number: int
     steps: int
-    """Agent steps T."""
+    """Number of agent steps, T."""
     frames: int
-    """Env steps."""
+    """Number of env steps."""
     total_reward: float
-    """The return: the sum of all rewards, without discount."""
+    """Undiscounted return, the sum of all rewards."""
     terminated: bool
     seed: int
-    """What the environment was reset with."""
+    """Seed with which the environment was reset."""
     policy: str
+    """Name of the policy."""
     environment: dict[str, Any]
     """Task, shapes and settings; `made_by` has versions and renderer."""
     size: int
-    """Bytes of the file."""
+    """Size of the file in bytes."""
     sha256: str
-    """Of the file."""
+    """SHA-256 of the file."""
 
     def problem(self) -> str:
-        """Say what is wrong with its values, as in a damaged line of an index; empty where nothing is."""
+        """Return what is wrong with the values, as in a damaged index, or an empty string."""
         for name, kind in type(self).__annotations__.items():
             if not _FITS[kind](value := getattr(self, name)):
                 return f"its {name} is {shortened(str(value), _SHOWN)}"
@@ -109,21 +110,21 @@ class EpisodeRecord(NamedTuple):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return what all the episodes of a store must have in common."""
-        settings = {"time_limit": TIME_LIMIT} | self.environment  # which records of older versions do not say
+        """Settings that all episodes of a store must have in common."""
+        settings = {"time_limit": TIME_LIMIT} | self.environment  # records of older versions have no time_limit
         return {name: value for name, value in settings.items() if name != "made_by"}
 
 
 class DamagedEpisodeError(ForbesError):
-    """A file is not what the index says."""
+    """The file of an episode does not match the index."""
 
     def __init__(self, path: Path, reason: str) -> None:
-        super().__init__(f"{path}: damaged ({reason}). Put it aside with: forbes data check {path.parent}")
+        super().__init__(f"{path}: damaged ({reason}). Move it to quarantine with: forbes data check {path.parent}")
         self.reason = reason
 
 
 def problem_of(episode: Episode) -> str:
-    """Say what is wrong with the arrays of an episode; empty where they are whole."""
+    """Return what is wrong with the arrays of an episode, or an empty string."""
     count = len(episode.observation)
     for name, dtypes, dimensions in (
         ("observation", ("uint8", "float32"), (2, 4)),
@@ -136,22 +137,22 @@ def problem_of(episode: Episode) -> str:
         if not np.isfinite(array).all():
             return f"its {name} is not finite at step {np.argwhere(~np.isfinite(array))[0, 0]}"
     if episode.action[0].any() or episode.reward[0] != 0:
-        return "its first action or reward is not zero, expected at index t the action that led to the observation"
+        return "its first action or reward is not zero, expected index t to have the action that led to o_t"
     return ""
 
 
 def problem_of_environment(environment: dict[str, Any]) -> str:
-    """Say what is wrong with what a record says of its environment; empty where nothing is."""
-    for name, fits in _SAID.items():
+    """Return what is wrong with the environment of a record, or an empty string."""
+    for name, fits in _ENVIRONMENT.items():
         if name not in environment:
-            return f"its environment has no {name}, expected what `describe_environment` gives"
+            return f"its environment has no {name}, expected the result of `describe_environment`"
         if not fits(value := environment[name]):
             return f"its environment's {name} is {shortened(str(value), _SHOWN)}"
-    return "" if type(environment.get("made_by", {})) is dict else "its environment's made_by is no mapping"
+    return "" if type(environment.get("made_by", {})) is dict else "its environment's made_by is not a mapping"
 
 
 def problem_with(environment: dict[str, Any], episode: Episode) -> str:
-    """Say what is wrong with what is recorded of an episode's environment; empty where nothing is."""
+    """Return the disagreement between the recorded environment and the arrays of an episode, or an empty string."""
     if problem := problem_of_environment(environment):
         return problem
     arrays = {"observation_shape": list(episode.observation.shape[1:]), "action_dim": episode.action.shape[1]}
@@ -162,7 +163,7 @@ def problem_with(environment: dict[str, Any], episode: Episode) -> str:
 
 
 def pack_episode(episode: Episode, about: dict[str, Any]) -> bytes:
-    """Return the content of the file; the same episode gives the same bytes."""
+    """Return the content of the file. The same episode results in the same bytes."""
     content = io.BytesIO()
     arrays = {name: getattr(episode, name) for name in _ARRAYS}
     np.savez(content, allow_pickle=False, **arrays, meta=np.array(json.dumps(about)))
@@ -170,15 +171,15 @@ def pack_episode(episode: Episode, about: dict[str, Any]) -> bytes:
 
 
 def map_episode(path: Path, record: EpisodeRecord, verify: bool) -> Episode:
-    """Open an episode without reading it; its arrays are views of the mapped file, and keep it open.
+    """Memory-map an episode. Its arrays are views of the mapped file, and keep it open.
 
     Args:
-        path: the file.
-        record: what the index says of it.
-        verify: read it all, and compare the hash and the arrays with what they must be.
+        path: file of the episode.
+        record: entry of the episode in the index.
+        verify: read the whole file, compare its hash, and check the arrays.
 
     Raises:
-        DamagedEpisodeError: where it is not what the record says.
+        DamagedEpisodeError: if the file does not match the record.
     """
     try:
         with path.open("rb") as file:
@@ -203,14 +204,14 @@ def map_episode(path: Path, record: EpisodeRecord, verify: bool) -> Episode:
 
 
 def read_record(path: Path) -> EpisodeRecord:
-    """Read what a whole file says of its own episode.
+    """Read the record of an episode from its own file, and verify the file.
 
     Raises:
-        ForbesError: where it is damaged, or not a file of `pack_episode`.
+        ForbesError: if the file is damaged, or was not written by `pack_episode`.
     """
     content = path.read_bytes()
     with (
-        readable(path, "an episode", "Put it aside"),
+        readable(path, "an episode", "Move it away"),
         np.load(io.BytesIO(content), allow_pickle=False) as arrays,
     ):
         about = json.loads(arrays["meta"].item())
@@ -222,7 +223,7 @@ def read_record(path: Path) -> EpisodeRecord:
 
 
 def _view(mapped: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Find an array's bytes in the archive: behind the member's own header and that of the `.npy` format."""
+    """Return a view of an array in the archive, after the headers of the member and of the `.npy` format."""
     if member.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{member.filename} is compressed")
     name_length, extra_length = struct.unpack_from("<HH", mapped, member.header_offset + _LOCAL_HEADER - 4)
@@ -231,5 +232,5 @@ def _view(mapped: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
         raise ValueError(f"{member.filename} is not of version 1.0 of its format")
     shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(mapped)
     if dtype.hasobject or fortran_order:
-        raise ValueError(f"{member.filename} holds objects, or columns first")
+        raise ValueError(f"{member.filename} has dtype object or column-major order")
     return np.frombuffer(mapped, dtype, math.prod(shape), mapped.tell()).reshape(shape)

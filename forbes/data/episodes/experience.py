@@ -1,4 +1,4 @@
-"""Episodes that an agent plays while it learns: an environment, the store they go to, and the windows drawn from it."""
+"""Experience of a learning agent: an environment, a store of its episodes, and segments sampled from the store."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -21,17 +21,17 @@ __all__ = ["Experience"]
 
 
 class Experience(SequenceSource):
-    """What an agent has lived through so far: a `Replay` that begins empty and grows by `collect`.
+    """A `Replay` that is empty at first and grows by `collect`.
 
-    All episodes are of the training split. A checkpoint keeps the watermark; a run that goes on from it puts later
-    episodes aside, and plays them anew.
+    All episodes belong to the training split. A checkpoint stores the number of episodes. A run that resumes from it
+    moves later episodes away and replays them.
 
     Args:
-        task: as for `forbes data collect`: `cartpole_swingup`, `mountain_hike`, `gymnasium:ID`, a class of your own.
-        options: of its environment, e.g. `{pixels: false, action_repeat: 4}`.
-        capacity: agent steps of the latest episodes that are kept; None keeps all.
-        timeout: seconds in which the environment must answer; one that does not is started anew.
-        time_limit: steps after which an episode that has not ended by itself is truncated.
+        task: task as for `forbes data collect`: `cartpole_swingup`, `mountain_hike`, `gymnasium:ID`, or your own class.
+        options: options of the environment, e.g. `{pixels: false, action_repeat: 4}`.
+        capacity: maximal number of agent steps to keep, in the latest episodes; None keeps all.
+        timeout: seconds within which the environment must answer before it is restarted.
+        time_limit: number of steps after which an episode is truncated.
 
     Raises:
         ForbesError: for an unknown task or option, a timeout that is not above 0, or a time_limit below 1.
@@ -66,47 +66,47 @@ class Experience(SequenceSource):
 
     @cached_property
     def environment(self) -> EnvironmentProcess:
-        """The environment, in a process that starts when it is first asked for."""
+        """The environment, in a process that starts on first use."""
         return EnvironmentProcess(self._make, self.timeout, self.time_limit)
 
     @cached_property
     def player(self) -> EpisodeWorker:
-        """What plays while this process trains; it starts when it is first asked for."""
+        """Worker that plays episodes while this process trains. It starts on first use."""
         return EpisodeWorker(self._make, self.timeout, self.time_limit)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:  # type: ignore[override]
-        """See `SequenceSource`."""
+        """Shape of one observation, without batch and time."""
         return tuple(self._known_shapes()["observation_shape"])
 
     @property
     def action_dim(self) -> int:  # type: ignore[override]
-        """See `SequenceSource`."""
+        """Dimension of an action, A."""
         return int(self._known_shapes()["action_dim"])
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
-        """See `SequenceSource`."""
+        """Whether an action is a one-hot vector."""
         return bool(self._known_shapes()["discrete"])
 
     def recall(self, folder: Path) -> None:
-        """Take the shapes from the episodes of a store, where it has some: then no environment starts to tell them."""
+        """Read the shapes from stored episodes, if there are any, so that no environment has to be started."""
         newest = max(EpisodeStore(folder).records.values(), default=None)
         self._shapes = newest and newest.environment
 
     def _known_shapes(self) -> dict[str, Any]:
-        """Return the shapes, from the environment unless they are known, as a store records them."""
+        """Return the description of the environment, which is started only if there are no stored episodes."""
         if self._shapes is None:
             self._shapes = describe_environment(self.environment)
         return self._shapes
 
     def open(self, folder: Path) -> None:
-        """Keep the episodes in a folder, which no other process may write to until `close`."""
+        """Open a folder for the episodes, and lock it until `close`."""
         self._writer = EpisodeWriter(folder).__enter__()
-        self._look()
+        self._refresh()
 
     def close(self) -> None:
-        """Leave the folder and end the environment; what is known of the episodes stays known."""
+        """Unlock the folder and close the environment. Episodes and shapes remain accessible."""
         if self._writer is not None:
             self._writer.__exit__()
         for name in ("environment", "player"):
@@ -114,48 +114,48 @@ class Experience(SequenceSource):
                 self.__dict__.pop(name).close()
 
     def collect(self, until: int, make_policy: MakePolicy, policy: str, seed: int) -> Iterator[EpisodeRecord]:
-        """Play until there have been so many episodes; episode n depends on (seed, n) and the policy only.
+        """Play and store episodes up to number `until`. Episode n depends only on (seed, n) and the policy.
 
         Args:
-            until: episodes, those there are included.
-            make_policy: makes the policy of an episode.
-            policy: its name, for the record.
-            seed: of episodes and policies.
+            until: total number of episodes, including existing ones.
+            make_policy: function that makes the policy of an episode.
+            policy: name of the policy, for the record.
+            seed: random seed for episodes and policies.
         """
-        for record in collect_episodes(self.environment, self._open(), make_policy, policy, until, seed):
-            self._look()
+        for record in collect_episodes(self.environment, self._require_writer(), make_policy, policy, until, seed):
+            self._refresh()
             yield record
 
     def begin(self, make_policy: MakePolicy, seed: int) -> None:
-        """Let the next episode be played while this process does something else; `finish` stores it.
+        """Start the next episode in the background; `finish` stores it.
 
         Args:
-            make_policy: as for `collect`; can be pickled.
-            seed: as for `collect`.
+            make_policy: function that makes the policy of the episode; must be picklable.
+            seed: random seed, as for `collect`.
         """
-        number = self._open().watermark
+        number = self._require_writer().watermark
         self.player.begin(make_policy, number, episode_seed(seed, number))
 
     def finish(self, policy: str, seed: int) -> EpisodeRecord:
-        """Wait for the episode that was begun, and store it; arguments as for `collect`."""
-        writer, episode = self._open(), self.player.finish()
-        chance = episode_seed(seed, writer.watermark)
-        record = writer.append(episode, chance, policy, describe_environment(self.environment))
-        self._look()
+        """Wait for the episode started by `begin`, and store it. The arguments are those of `collect`."""
+        writer, episode = self._require_writer(), self.player.finish()
+        seed_of_episode = episode_seed(seed, writer.watermark)
+        record = writer.append(episode, seed_of_episode, policy, describe_environment(self.environment))
+        self._refresh()
         return record
 
     def forget(self) -> None:
-        """Delete the episodes beyond the capacity, which are drawn no more; a checkpoint must know of the newest.
+        """Delete episodes beyond `capacity`. Call only after a checkpoint has recorded the newest one.
 
-        The checkpoint before it, which lacks the newest, may still be read: what it draws from stays.
+        Episodes that the previous checkpoint, without the newest episode, may still sample are kept.
         """
-        writer = self._open()
+        writer = self._require_writer()
         writer.forget(first_held([*writer.records.values()][:-1], self.capacity))
-        self._look()
+        self._refresh()
 
     def growth(self, episodes: int) -> float:
-        """Estimate the bytes by which so many further episodes make the store grow, from those that are there."""
-        records = self._open().records.values()
+        """Estimate the number of bytes by which the store grows with `episodes` more, from the existing ones."""
+        records = self._require_writer().records.values()
         steps = sum(record.steps for record in records)
         more = episodes * steps / len(records)
         if self.capacity is not None:
@@ -163,9 +163,12 @@ class Experience(SequenceSource):
         return more * sum(record.size for record in records) / steps
 
     def begun(self, policy: str, seed: int, most: int) -> int:
-        """Count the first episodes, of at most so many, that `collect` with these arguments would play again."""
+        """Return how many of the first `most` stored episodes `collect` would reproduce exactly.
+
+        These are the leading episodes with the same policy, seed and number.
+        """
         count = 0
-        for record in self._open().records.values():
+        for record in self._require_writer().records.values():
             same = record.policy == policy and record.seed == episode_seed(seed, count) and record.number == count
             if not same or count == most:
                 break
@@ -174,59 +177,59 @@ class Experience(SequenceSource):
 
     @property
     def newest(self) -> EpisodeRecord:
-        """The record of the latest episode that is there."""
-        return list(self._open().records.values())[-1]
+        """Record of the latest stored episode."""
+        return list(self._require_writer().records.values())[-1]
 
     @property
     def env_steps(self) -> int:
-        """Frames of the simulator so far, action repeat included."""
-        writer = self._open()
+        """Number of simulator frames so far, including action repeat."""
+        writer = self._require_writer()
         return writer.index.forgotten_frames + sum(record.frames for record in writer.records.values())
 
     @property
     def agent_steps(self) -> int:
-        """Actions so far."""
-        writer = self._open()
+        """Number of actions so far."""
+        writer = self._require_writer()
         return writer.index.forgotten_steps + sum(record.steps for record in writer.records.values())
 
     @property
     def watermark(self) -> int | None:
-        """How many episodes there have been; to set it to fewer puts the later ones aside."""
+        """Number of episodes so far. Setting a smaller number moves the later ones to `set_aside/`."""
         return None if self._writer is None else self._writer.watermark
 
     @watermark.setter
     def watermark(self, value: int | None) -> None:
         if value is not None:
-            self._open().set_aside(value)
-            self._look()
+            self._require_writer().set_aside(value)
+            self._refresh()
 
     def sha256(self) -> str:
-        """Hash the episodes that there are."""
+        """Hash the stored episodes."""
         return self._replay.sha256() if self._replay else ""
 
     def size(self, split: Split) -> int:
-        """Count the windows of a split; held-out ones are none."""
+        """Return the number of segments of a split; 0 for held-out splits."""
         return self._replay.size(split) if self._replay else 0
 
     def train_index(self, batch_size: int, length: int, seed: int, update: int) -> Tensor:
-        """See `Replay.train_index`."""
-        return self._drawn().train_index(batch_size, length, seed, update)
+        """Sample the segments of one training batch, int64 `(B,)`, as `Replay.train_index` does."""
+        return self._require_replay().train_index(batch_size, length, seed, update)
 
     def latest(self, count: int) -> Tensor:
-        """See `Replay.latest`."""
-        return self._drawn().latest(count)
+        """Return the first segments of the newest episodes, the newest first, int64 `(count,)` or fewer."""
+        return self._require_replay().latest(count)
 
     def gather(self, split: Split, index: Tensor, length: int) -> Segments:
-        """See `Replay.gather`."""
-        return self._drawn().gather(split, index, length)
+        """Return segments by index, int64 (B,), read from the mapped files."""
+        return self._require_replay().gather(split, index, length)
 
     def decode(self, compact: Segments) -> SequenceBatch:
-        """See `Replay.decode`."""
-        return self._drawn().decode(compact)
+        """Add the state, which is unknown."""
+        return self._require_replay().decode(compact)
 
-    def _look(self) -> None:
-        """Draw from what is there now."""
-        writer = self._open()
+    def _refresh(self) -> None:
+        """Sample from the episodes that are stored now."""
+        writer = self._require_writer()
         if not writer.records:
             self._replay = None
         elif self._replay is None:
@@ -234,12 +237,12 @@ class Experience(SequenceSource):
         else:
             self._replay.refresh()
 
-    def _open(self) -> EpisodeWriter:
+    def _require_writer(self) -> EpisodeWriter:
         if self._writer is None:
             raise ForbesError(f"Experience: the episodes of {self.task} are not open, expected a running `forbes fit`")
         return self._writer
 
-    def _drawn(self) -> Replay:
+    def _require_replay(self) -> Replay:
         if self._replay is None:
             raise ForbesError(f"Experience: there are no episodes of {self.task} yet. Add the callback Collect")
         return self._replay

@@ -1,4 +1,4 @@
-"""The index of an episode store: lines that are appended, and rewritten as one file when many say nothing new."""
+"""The index of an episode store: lines are appended; when many are obsolete, the file is rewritten."""
 
 import json
 from pathlib import Path
@@ -11,22 +11,22 @@ from forbes.files import append_whole, replace_file
 __all__ = ["EpisodeIndex"]
 
 _SPARE = 1000
-"""Lines that an index may have beyond two for each episode before it is compacted."""
+"""Number of lines in excess of two per episode before an index is compacted."""
 _COUNTS = ("watermark", "first", "forgotten_steps", "forgotten_frames")
 
 
 class EpisodeIndex:
-    """What `index.jsonl` says of a store; any number of processes may read while one writes.
+    """The content of `index.jsonl`. Any number of processes may read it while one writes.
 
-    Each line is a JSON object: an `EpisodeRecord`, or one of ``{"set_aside_from": n}``, ``{"forgotten_before": n}``,
-    ``{"quarantined": n}``. A compacted index is the records that are left and, at its end, ``{"compacted": {...}}``
-    with the numbers below. An episode's line that is there twice changes nothing.
+    Each line is a JSON object: an `EpisodeRecord`, or one of `{"set_aside_from": n}`, `{"forgotten_before": n}`,
+    `{"quarantined": n}`. A compacted index has the remaining records and, at its end, `{"compacted": {...}}` with the
+    counts below. A duplicate line of an episode has no effect.
 
     Args:
-        path: the file; it need not exist.
+        path: the file; need not exist.
 
     Raises:
-        ForbesError: where a line cannot be read.
+        ForbesError: if a line cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -34,28 +34,29 @@ class EpisodeIndex:
         self.refresh()
 
     def refresh(self) -> None:
-        """Read the index again: another process may have added to it."""
+        """Read the index again, since another process may have extended it."""
         self.records: dict[int, EpisodeRecord] = {}
-        """By number, the oldest first."""
+        """Records by number, the oldest first."""
         self.watermark = 0
-        """The number that the next episode will have."""
+        """Number of the next episode."""
         self.first = 0
-        """Episodes before this number are forgotten."""
+        """Episodes before this number are deleted."""
         self.forgotten_steps, self.forgotten_frames = 0, 0
         text = self.path.read_text(errors="replace") if self.path.is_file() else ""
-        lines = text[: text.rfind("\n") + 1].splitlines()  # a kill may cut the last
-        for place, line in enumerate(lines, start=1):
+        lines = text[: text.rfind("\n") + 1].splitlines()  # a kill may truncate the last line
+        for line_number, line in enumerate(lines, start=1):
             try:
-                self._follow(json.loads(line))
+                self._apply(json.loads(line))
             except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
                 reason = f" ({error})" if type(error) is ValueError else ""
                 raise ForbesError(
-                    f"{self.path}: line {place} is not a line of the index{reason}. Delete it; the episode's file stays"
+                    f"{self.path}: line {line_number} is not a line of the index{reason}. Delete it; the episode's "
+                    "file is kept"
                 ) from error
         self.lines = len(lines)
 
-    def _follow(self, line: dict[str, Any]) -> None:
-        """Follow one line; raise a ValueError or the like where it is none."""
+    def _apply(self, line: dict[str, Any]) -> None:
+        """Apply one line to the state; raise a ValueError or similar if it is invalid."""
         if "number" in line:
             self.add(EpisodeRecord(**line))
             return
@@ -80,40 +81,40 @@ class EpisodeIndex:
             raise KeyError(event)
 
     def add(self, record: EpisodeRecord) -> None:
-        """Take a record, unless its line is there twice: numbers only grow. Only `append` and `compact` write."""
+        """Add a record, without writing it, unless it is a duplicate: numbers only grow."""
         if problem := record.problem():
             raise ValueError(problem)
         if record.number < self.watermark:
             return
         if name := self.differs(record):
-            raise ValueError(f"its {name} is not that of the episodes before")
+            raise ValueError(f"its {name} is not that of the previous episodes")
         self.records[record.number] = record
         self.watermark = record.number + 1
 
     def differs(self, record: EpisodeRecord) -> str:
-        """Name what an episode's environment has otherwise than that of the episodes here; empty where nothing."""
+        """Return the first setting in which an episode's environment differs from this store's, or an empty string."""
         ours, theirs = next(iter(self.records.values()), record).settings, record.settings
         return next((name for name in ours | theirs if ours.get(name) != theirs.get(name)), "")
 
     def append(self, line: dict[str, Any]) -> None:
-        """Append a line, whole or not at all; when this returns, it survives a power loss."""
+        """Append a line atomically. After the return it survives a power loss."""
         append_whole(self.path, _encoded(line), sync=True)
-        self._follow(line)
+        self._apply(line)
         self.lines += 1
 
     def is_lost(self) -> bool:
-        """Tell whether the file has no whole line, or ends in zeros, as after a power loss on some disks."""
+        """Return whether the file has no complete line, or ends in zeros, as after a power loss on some disks."""
         content = self.path.read_bytes() if self.path.is_file() else b""
         whole, _, rest = content.rpartition(b"\n")
         return not whole or b"\0" in rest
 
     def compact_if_long(self) -> None:
-        """Compact an index that has mostly lines of what is gone."""
+        """Compact an index if most of its lines are obsolete."""
         if self.lines > 2 * len(self.records) + _SPARE:
             self.compact()
 
     def compact(self) -> None:
-        """Write what the index says with the fewest lines; at every instant the file is the old one or the new."""
+        """Rewrite the index atomically with as few lines as possible."""
         counts = {"compacted": {name: getattr(self, name) for name in _COUNTS}}
         lines = [*(record._asdict() for record in self.records.values()), counts]
         replace_file(self.path, b"".join(map(_encoded, lines)))

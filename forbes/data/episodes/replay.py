@@ -1,17 +1,18 @@
-"""Stored episodes as data: windows of fixed length, mapped from the disk."""
+"""Stored episodes as training data: segments of fixed length, memory-mapped."""
 
 import hashlib
+from collections.abc import Iterator
 from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from forbes.data.episodes.episode import EpisodeRecord
+from forbes.data.episodes.episode import Episode, EpisodeRecord
 from forbes.data.episodes.store import EpisodeStore, first_held
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError, require_at_least
+from forbes.rounding import ceil_div
 from forbes.seeding import generator
 from forbes.shapes import printed_by_shape
 
@@ -20,7 +21,7 @@ __all__ = ["Replay", "Segments"]
 
 @printed_by_shape
 class Segments(NamedTuple):
-    """Some windows as they are stored."""
+    """Segments of episodes as they are stored."""
 
     observation: Tensor
     """o_t, uint8 (B, T, C, H, W) or float32 (B, T, O); 0 on padding."""
@@ -31,7 +32,28 @@ class Segments(NamedTuple):
     mask: Tensor
     """False on padding, bool (B, T)."""
     ended: Tensor
-    """True on the last step of an episode that a process has ended, bool (B, T)."""
+    """True on the last step of an episode that terminated, bool (B, T)."""
+
+    @classmethod
+    def empty(cls, count: int, length: int, observation_shape: tuple[int, ...], action_dim: int) -> "Segments":
+        """Return `count` segments of padding."""
+        dtype = torch.uint8 if len(observation_shape) == 3 else torch.float32
+        return cls(
+            observation=torch.zeros(count, length, *observation_shape, dtype=dtype),
+            action=torch.zeros(count, length, action_dim),
+            reward=torch.zeros(count, length),
+            mask=torch.zeros(count, length, dtype=torch.bool),
+            ended=torch.zeros(count, length, dtype=torch.bool),
+        )
+
+    def fill(self, row: int, episode: Episode, start: int) -> None:
+        """Copy the steps of an episode from `start` on to segment `row`."""
+        end = min(start + self.mask.shape[1], len(episode.reward))
+        steps, filled = slice(start, end), slice(0, end - start)
+        for name in ("observation", "action", "reward"):
+            getattr(self, name).numpy()[row, filled] = getattr(episode, name)[steps]
+        self.mask[row, filled] = True
+        self.ended[row, end - start - 1] = episode.terminated and end == len(episode.reward)
 
 
 class _Table(NamedTuple):
@@ -39,32 +61,33 @@ class _Table(NamedTuple):
 
     numbers: list[int]
     lengths: Tensor
-    """Observations of each, int64 (E,)."""
+    """Number of observations of each episode, int64 (E,)."""
     ends: Tensor
-    """How many windows begin in this episode or an earlier one, int64 (E,)."""
+    """Number of segments that begin in this episode or an earlier one, int64 (E,)."""
 
 
 class Replay(SequenceSource):
-    r"""Windows of the episodes of a store (`forbes data collect`), which may grow meanwhile.
+    r"""Segments of the episodes of a store (`forbes data collect`), which may grow at the same time.
 
-    A training batch is uniform over episodes, then over the starts of windows that fit into the episode:
+    A training batch is uniform over episodes, then over the starts of segments that fit into the episode:
 
     .. math:: e \sim U\{1, \dots, E\}, \qquad k \sim U\{0, \dots, \max(0, n_e - T)\}, \qquad (o_{k+1}, \dots, o_{k+T})
 
-    so no window crosses episodes, and the last of an episode's :math:`n_e` observations is drawn as often as the first.
-    Batch i is a pure function of (seed, i, the episodes held). Held-out windows start at every `stride`-th observation.
-    A window that its episode does not fill is padded; one that starts within an episode has the action that led there.
+    so no segment crosses episodes, and the last of the :math:`n_e` observations of an episode is sampled as often as
+    the first. Batch i is a pure function of (seed, i, the episodes held). Held-out segments start at every `stride`-th
+    observation. A segment is padded if its episode is too short. If it starts within an episode, its first action is
+    the one that led there.
 
-    Of ten episodes, the ninth is of the validation split and the tenth of the test split (number mod `hold_out`).
+    Of ten episodes, the ninth is in the validation split and the tenth in the test split (number mod `hold_out`).
 
     Args:
-        path: the folder of the store.
-        capacity: agent steps of the latest episodes that are held; None holds all. The files stay.
-        hold_out: one episode in so many is of each held-out split; 0 gives all to the training.
-        stride: observations between the starts of held-out windows.
+        path: folder of the store.
+        capacity: maximal number of agent steps to sample from, the latest; None for all. No file is deleted.
+        hold_out: each held-out split has one episode out of `hold_out`; 0 uses all episodes for training.
+        stride: number of observations between the starts of held-out segments.
 
     Raises:
-        ForbesError: where the store is empty or its index damaged, or a number is not what it can be.
+        ForbesError: if the store is empty or its index damaged, or an argument is out of range.
 
     Example:
         >>> source = forbes.Replay("episodes/tiger")  # forbes data collect --task tiger --episodes 20 -o episodes/tiger
@@ -89,13 +112,13 @@ class Replay(SequenceSource):
         self.discrete: bool = environment["discrete"]
 
     def refresh(self) -> None:
-        """See the episodes that were added or set aside since; what is held changes here and nowhere else."""
+        """Read the index again. The episodes to sample from change only here."""
         self.store.refresh()
         self.watermark = self.store.watermark
 
     @property
     def watermark(self) -> int:
-        """How many episodes had ever been stored when it last looked; later ones are not seen."""
+        """Number of episodes ever stored at the last `refresh`. Later ones are ignored."""
         return self._watermark
 
     @watermark.setter
@@ -103,7 +126,7 @@ class Replay(SequenceSource):
         if value > self.store.watermark:
             raise ForbesError(
                 f"{self.path}: has {self.store.watermark} episodes, expected the {value} of the checkpoint. "
-                "Name the folder that was trained on"
+                "Name the folder used in training"
             )
         self._watermark = value
         self.__dict__.pop("_tables", None)
@@ -122,73 +145,67 @@ class Replay(SequenceSource):
 
     def _table(self, numbers: list[int], stride: int) -> _Table:
         lengths = torch.tensor([self.store.records[number].steps + 1 for number in numbers], dtype=torch.int64)
-        return _Table(numbers, lengths, (-(-lengths // stride)).cumsum(0))  # (E,), (E,)
+        return _Table(numbers, lengths, ceil_div(lengths, stride).cumsum(0))  # (E,), (E,)
 
     def _stride(self, split: Split) -> int:
         return 1 if split == "train" else self.stride
 
     def split_of(self, number: int) -> Split:
-        """Return the split of an episode; it depends on its number only, so it never changes."""
-        if self.hold_out == 0 or (place := self.hold_out - 1 - number % self.hold_out) > 1:
+        """Return the split of an episode. It depends only on its number, so it never changes."""
+        if self.hold_out == 0 or (from_end := self.hold_out - 1 - number % self.hold_out) > 1:
             return "train"
-        return "validation" if place else "test"
+        return "validation" if from_end else "test"
 
     def sha256(self) -> str:
-        """Hash the episodes held, by their hashes."""
+        """Hash the episodes to sample from, by their hashes."""
         return hashlib.sha256(" ".join(record.sha256 for record in self._held()).encode()).hexdigest()
 
     def size(self, split: Split) -> int:
-        """Count the windows of a split: of the training those from every observation, else from every `stride`-th."""
+        """Return the number of segments: one per observation in training, else one per `stride` observations."""
         ends = self._tables[split].ends
         return int(ends[-1]) if len(ends) else 0
 
     def train_index(self, batch_size: int, length: int, seed: int, update: int) -> Tensor:
-        """Draw the windows of one training batch, int64 `(B,)`, with replacement."""
+        """Sample the segments of one training batch with replacement, int64 `(B,)`."""
         table = self._require("train")
         draw = generator(seed, "replay", update)
         episode = torch.randint(len(table.numbers), (batch_size,), generator=draw)  # (B,)
-        starts = (table.lengths[episode] - length + 1).clamp(min=1)  # (B,), how many there are
+        starts = (table.lengths[episode] - length + 1).clamp(min=1)  # (B,), number of possible starts
         start = (torch.rand(batch_size, generator=draw, dtype=torch.float64) * starts).long()  # (B,)
-        return (table.ends - table.lengths)[episode] + start  # a training window begins at every observation
+        return (table.ends - table.lengths)[episode] + start  # a training segment begins at every observation
 
     def latest(self, count: int) -> Tensor:
-        """Return the windows that the newest episodes begin with, the newest first, int64 `(count,)` or fewer."""
+        """Return the first segments of the newest episodes, the newest first, int64 `(count,)` or fewer."""
         table = self._require("train")
-        return (table.ends - table.lengths).flip(0)[:count]  # a training window begins at every observation
+        return (table.ends - table.lengths).flip(0)[:count]  # a training segment begins at every observation
 
     def gather(self, split: Split, index: Tensor, length: int) -> Segments:
-        """Copy windows by index, int64 (B,), from the mapped files."""
+        """Return segments by index, int64 (B,), read from the mapped files."""
         require_at_least(1, "Replay", length=length)
-        table, count, stride = self._require(split), len(index), self._stride(split)
+        segments = Segments.empty(len(index), length, self.observation_shape, self.action_dim)
+        for row, (number, start) in enumerate(self._locate(split, index)):
+            segments.fill(row, self.store.episode(number), start)
+        return segments
+
+    def _locate(self, split: Split, index: Tensor) -> Iterator[tuple[int, int]]:
+        """Yield the number of the episode and the start of each segment."""
+        table, stride = self._require(split), self._stride(split)
         row = torch.searchsorted(table.ends, index, right=True)  # (B,)
-        windows = -(-table.lengths // stride)  # (E,)
-        start = stride * (index - (table.ends - windows)[row])  # (B,)
-        dtype = np.uint8 if len(self.observation_shape) == 3 else np.float32
-        observation = np.zeros((count, length, *self.observation_shape), dtype)
-        action = np.zeros((count, length, self.action_dim), np.float32)
-        reward, mask = np.zeros((count, length), np.float32), np.zeros((count, length), bool)
-        ended = np.zeros((count, length), bool)
-        for window, (place, begin) in enumerate(zip(row.tolist(), start.tolist(), strict=True)):
-            episode = self.store.episode(table.numbers[place])
-            end = min(begin + length, len(episode.reward))
-            steps, there = slice(begin, end), slice(0, end - begin)
-            observation[window, there] = episode.observation[steps]
-            action[window, there], reward[window, there] = episode.action[steps], episode.reward[steps]
-            mask[window, there] = True
-            ended[window, end - begin - 1] = episode.terminated and end == len(episode.reward)
-        return Segments(*map(torch.from_numpy, (observation, action, reward, mask, ended)))
+        before = table.ends - ceil_div(table.lengths, stride)  # (E,), segments of earlier episodes
+        start = stride * (index - before[row])  # (B,)
+        return zip((table.numbers[episode] for episode in row.tolist()), start.tolist(), strict=True)
 
     def decode(self, compact: Segments) -> SequenceBatch:
-        """Add the state, which is not known."""
+        """Add the state, which is unknown."""
         observation, action, reward, mask, ended = compact
         return SequenceBatch(observation, action, reward, mask, reward.new_zeros(*reward.shape, 0), ended)
 
     def _require(self, split: Split) -> _Table:
-        """Return a split that has episodes."""
+        """Return the table of a split; raise a ForbesError if it has no episodes."""
         table = self._tables[split]
         if not table.numbers:
             raise ForbesError(
-                f"{self.path}: no episode is of the split {split}, expected one of {self.hold_out}. Collect more, or "
-                "choose a smaller hold_out"
+                f"{self.path}: the {split} split has no episodes, expected one out of {self.hold_out}. Collect more, "
+                "or choose a smaller hold_out"
             )
         return table

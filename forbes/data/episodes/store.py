@@ -1,15 +1,15 @@
-"""The episode store: a folder of episodes that only grows, and an index that survives a kill at any instant.
+"""The episode store: a folder of episodes, and an index that survives a kill at any time.
 
 ::
 
     DIR/
-      index.jsonl     one JSON object a line, appended and synced: an episode, or what became of some (`EpisodeIndex`)
-      000000.npz …    an episode each, written beside, synced and renamed before its line is appended
-      set_aside/      episodes of a future that a resumed run has not lived, and whole files the index does not know
+      index.jsonl     one JSON object per line, appended and synced: an episode, or an event (`EpisodeIndex`)
+      000000.npz …    one episode each, written to a temporary file, synced and renamed before its line is appended
+      set_aside/      episodes later than the checkpoint of a resumed run, and intact files that the index does not list
       quarantine/     damaged files
 
-Files with other names are left alone. The watermark is the number that the next episode will have: a checkpoint that
-holds it says "up to here".
+Other files are left alone. The watermark is the number of the next episode. A checkpoint stores it to record which
+episodes exist.
 """
 
 import hashlib
@@ -38,17 +38,17 @@ from forbes.files import drop_half_line, locked, remove_halves, replace_file
 __all__ = ["EpisodeStore", "EpisodeWriter", "first_held"]
 
 _OPEN_FILES = 256
-"""Episodes that are mapped at a time, each with an open file; systems allow 1024 of these."""
+"""Maximal number of mapped episodes, each with an open file. Systems typically allow 1024 open files."""
 
 
 class EpisodeStore:
-    """The episodes of a folder, as the index says; any number of processes may read while one writes.
+    """The episodes in the index of a folder. Any number of processes may read while one writes.
 
     Args:
-        path: the folder.
+        path: folder of the store.
 
     Raises:
-        ForbesError: where a line of the index cannot be read.
+        ForbesError: if a line of the index cannot be read.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -59,16 +59,16 @@ class EpisodeStore:
 
     @property
     def records(self) -> dict[int, EpisodeRecord]:
-        """The episodes by number, the oldest first."""
+        """Records of the episodes by number, the oldest first."""
         return self.index.records
 
     @property
     def watermark(self) -> int:
-        """The number that the next episode will have."""
+        """Number of the next episode."""
         return self.index.watermark
 
     def require_folder(self) -> None:
-        """Raise a ForbesError where there is none."""
+        """Raise a ForbesError if the folder does not exist."""
         if not self.path.is_dir():
             raise ForbesError(
                 f"{self.path}: no such folder. Name one that has episodes, or collect some: "
@@ -76,7 +76,7 @@ class EpisodeStore:
             )
 
     def require_episodes(self) -> None:
-        """Raise a ForbesError where there are none."""
+        """Raise a ForbesError if there are no episodes."""
         self.require_folder()
         if self.records:
             return
@@ -92,30 +92,30 @@ class EpisodeStore:
         )
 
     def refresh(self) -> None:
-        """Read the index again: another process may have added to it."""
+        """Read the index again, since another process may have extended it."""
         self.index.refresh()
         self._close_maps()
 
     def _close_maps(self) -> None:
-        """Let go of the files of episodes that are no longer here, which keep their room on the disk as long."""
-        here = {(number, record.sha256) for number, record in self.records.items()}
-        self._mapped = {key: episode for key, episode in self._mapped.items() if key in here}
+        """Unmap episodes that are no longer in the index, so that their disk space is freed."""
+        listed = {(number, record.sha256) for number, record in self.records.items()}
+        self._mapped = {key: episode for key, episode in self._mapped.items() if key in listed}
 
     def file(self, number: int) -> Path:
-        """Return the path of an episode."""
+        """Return the path of an episode's file."""
         return self.path / f"{number:06d}.npz"
 
     def files(self) -> list[int]:
-        """List the numbers of the episodes whose files are in the folder, in order."""
+        """Return the sorted numbers of the episodes whose files are in the folder."""
         names = (path.stem for path in self.path.glob("*.npz"))
         numbers = {int(name) for name in names if re.fullmatch("[0-9]{6,}", name)}
         return sorted(number for number in numbers if self.file(number).is_file())
 
     def episode(self, number: int) -> Episode:
-        """Open an episode; the first time in this process, compare it with its hash.
+        """Memory-map an episode. Its hash is verified on the first access of this process.
 
         Raises:
-            DamagedEpisodeError: where the file is not what the index says.
+            DamagedEpisodeError: if the file does not match the index.
         """
         record = self.records[number]
         key = number, record.sha256
@@ -124,19 +124,19 @@ class EpisodeStore:
             episode = map_episode(self.file(number), record, verify=record.sha256 not in self._verified)
             self._verified.add(record.sha256)
             while len(self._mapped) >= _OPEN_FILES:
-                del self._mapped[next(iter(self._mapped))]  # the one whose last use is longest ago
+                del self._mapped[next(iter(self._mapped))]  # the least recently used
         self._mapped[key] = episode
         return episode
 
 
 class EpisodeWriter(EpisodeStore):
-    """A store that this process, and no other, changes: use it in a `with` statement.
+    """A store that is locked for this process. Use it in a `with` statement.
 
-    Entering mends what a kill has left: half a line of the index, half a file, and a whole file without its line. An
-    index that is lost, or ends in zeros, is rebuilt from the episodes' files, and stderr says so.
+    Entering repairs the traces of a kill: a truncated line of the index, a partial file, and a complete file without
+    its line. An index that is lost, or ends in zeros, is rebuilt from the files, with a warning on stderr.
 
     Raises:
-        ForbesError: on entering, where another process writes to the folder.
+        ForbesError: on entering, if another process writes to the folder.
     """
 
     def __enter__(self) -> Self:
@@ -155,19 +155,20 @@ class EpisodeWriter(EpisodeStore):
         self._stack.close()
 
     def _rebuild(self) -> None:
-        """Take the episodes that a lost index does not know from their files, and say so."""
-        unknown = [number for number in self.files() if number >= self.watermark]
-        found = sum(map(self._restore, unknown))
-        if unknown:
+        """Add the episodes that a lost index does not list from their files, and print a warning."""
+        unlisted = [number for number in self.files() if number >= self.watermark]
+        restored = sum(map(self._restore, unlisted))
+        if unlisted:
             self.index.compact()
             print(
-                f"WARNING: {self.index.path}: lost or overwritten with zeros; {found} of {len(unknown)} episodes are "
-                "restored from their files, those that cannot be are set aside, and forgotten ones no longer counted",
+                f"WARNING: {self.index.path}: lost or overwritten with zeros; {restored} of {len(unlisted)} episodes "
+                "are restored from their files, the others are moved to set_aside/, and deleted ones are no longer "
+                "counted",
                 file=sys.stderr,
             )
 
     def _restore(self, number: int) -> bool:
-        """Take an episode from its file, unless it is damaged, of another number or of another environment."""
+        """Add an episode from its file, unless it is damaged or has another number or environment."""
         try:
             record = read_record(self.file(number))
         except ForbesError:
@@ -178,16 +179,16 @@ class EpisodeWriter(EpisodeStore):
         return fits
 
     def append(self, episode: Episode, seed: int, policy: str, environment: dict[str, Any]) -> EpisodeRecord:
-        """Add an episode: when this returns, it survives a power loss; if it raises, the store is as it was.
+        """Add an episode. After the return it survives a power loss; on an error the store is unchanged.
 
         Args:
-            episode: whole, from its first observation to its last.
-            seed: that the environment was reset with.
-            policy: that acted.
-            environment: what `describe_environment` gives: task, shapes and settings, plain values.
+            episode: complete episode, from its first to its last observation.
+            seed: seed with which the environment was reset.
+            policy: name of the policy.
+            environment: description from `describe_environment`: task, shapes and settings, as plain values.
 
         Raises:
-            ForbesError: where the episode is not whole, is of another environment, or cannot be written.
+            ForbesError: if the episode is invalid, is from another environment, or cannot be written.
         """
         number = self.watermark
         about: dict[str, Any] = {
@@ -201,13 +202,13 @@ class EpisodeWriter(EpisodeStore):
             "environment": json.loads(json.dumps(environment)),
         }
         if problem := problem_of(episode) or problem_with(about["environment"], episode):
-            raise ForbesError(f"{self.file(number)}: not stored, {problem}. Mend the environment or the policy")
+            raise ForbesError(f"{self.file(number)}: not stored, {problem}. Fix the environment or the policy")
         content = pack_episode(episode, about)
         record = EpisodeRecord(**about, size=len(content), sha256=hashlib.sha256(content).hexdigest())
         if name := self.index.differs(record):
-            there = next(iter(self.records.values())).settings.get(name)
+            stored = next(iter(self.records.values())).settings.get(name)
             raise ForbesError(
-                f"{self.path}: holds episodes whose {name} is {there}, not {record.settings.get(name)}. "
+                f"{self.path}: has episodes whose {name} is {stored}, not {record.settings.get(name)}. "
                 "Choose another folder"
             )
         try:
@@ -219,10 +220,10 @@ class EpisodeWriter(EpisodeStore):
         return record
 
     def set_aside(self, watermark: int) -> int:
-        """Go back to a checkpoint: move the episodes from this number on out of the way, and count them.
+        """Go back to a checkpoint: move the episodes from this number on to `set_aside/`, and return their number.
 
         Raises:
-            ForbesError: where the store has never been so far.
+            ForbesError: if the store has had fewer episodes.
         """
         if watermark > self.watermark:
             raise ForbesError(
@@ -237,20 +238,20 @@ class EpisodeWriter(EpisodeStore):
         return later
 
     def forget(self, before: int) -> None:
-        """Delete the episodes before this number; one that a checkpoint may still draw must not be among them."""
+        """Delete the episodes before this number. No checkpoint in use may still sample from them."""
         if before > self.index.first:
             self.index.append({"forgotten_before": before})
             self._tidy()
             self.index.compact_if_long()
 
     def quarantine(self, number: int) -> None:
-        """Take a damaged episode out of the store, and keep its file, if there is one, for the curious."""
+        """Remove a damaged episode from the index, and move its file, if there is one, to `quarantine/`."""
         self.index.append({"quarantined": number})
         if self.file(number).exists():
             _move(self.file(number), self.path / "quarantine")
 
     def damage(self) -> dict[int, str]:
-        """Read every file anew, and say of each damaged one what is wrong."""
+        """Verify every file, and return the damaged episodes with the reason."""
         found = {}
         for number, record in self.records.items():
             try:
@@ -260,7 +261,7 @@ class EpisodeWriter(EpisodeStore):
         return found
 
     def _tidy(self) -> None:
-        """Put the files that the index does not know aside, and delete the forgotten ones."""
+        """Move files that the index does not list to `set_aside/`, and delete those it has forgotten."""
         self._close_maps()
         for number in self.files():
             if number < self.index.first:
@@ -270,7 +271,7 @@ class EpisodeWriter(EpisodeStore):
 
 
 def first_held(records: Iterable[EpisodeRecord], capacity: int | None) -> int:
-    """Return the number of the oldest episode that a replay of so many agent steps holds; the latest is always held."""
+    """Return the number of the oldest episode within `capacity` agent steps. The latest one is always included."""
     first, steps = 0, 0
     for record in reversed(list(records)):
         steps += record.steps
@@ -281,7 +282,7 @@ def first_held(records: Iterable[EpisodeRecord], capacity: int | None) -> int:
 
 
 def _move(path: Path, folder: Path) -> None:
-    """Move a file to a folder, under a name that is free there."""
+    """Move a file to a folder, with a suffix if its name exists there."""
     folder.mkdir(exist_ok=True)
     target, copy = folder / path.name, 1
     while target.exists():

@@ -1,4 +1,4 @@
-"""A process that plays episodes while this one trains."""
+"""A worker process that plays episodes while this process trains."""
 
 import atexit
 import pickle
@@ -19,51 +19,51 @@ __all__ = ["EpisodeWorker"]
 
 
 class EpisodeWorker:
-    """Plays one episode at a time in a process of its own, on the CPU, with one thread.
+    """Plays one episode at a time in a separate process, on the CPU, with one thread.
 
-    The environment lives in a process below that one, as it does below this one without a player. A process that dies
-    is started again, and plays its episode again. Close it: it does not end before this process does.
+    The environment has its own process, a child of the worker's. A worker process that dies is restarted and replays
+    its episode. Call `close` at the end.
 
     Args:
-        make: makes the environment.
-        timeout: see `EnvironmentProcess`.
-        time_limit: likewise.
+        make: function that makes the environment; must be picklable.
+        timeout: seconds within which the environment must answer.
+        time_limit: number of steps after which an episode is truncated.
     """
 
     def __init__(self, make: Callable[[], Environment], timeout: float = 60.0, time_limit: int = TIME_LIMIT) -> None:
         self._arguments = make, timeout, time_limit
         self._start()
-        atexit.register(self.close)  # multiprocessing would wait for it
+        atexit.register(self.close)  # multiprocessing would wait for the process
 
     def begin(self, make_policy: MakePolicy, number: int, seed: int) -> None:
-        """Let it play an episode by the policy as it is now.
+        """Start an episode with the current weights of the policy.
 
         Args:
-            make_policy: can be pickled.
-            number: of the episode, for messages.
-            seed: of environment and policy.
+            make_policy: function that makes the policy; must be picklable.
+            number: number of the episode, for messages.
+            seed: random seed for environment and policy.
         """
         self._number = number
-        self._message = pickle.dumps((make_policy, number, seed))  # a pipe's own way shares the memory of tensors
+        self._message = pickle.dumps((make_policy, number, seed))  # Connection.send would share the tensors' memory
         self._ask()
 
     def finish(self, attempts: int = ATTEMPTS) -> Episode:
-        """Wait for the episode.
+        """Wait for the episode and return it.
 
         Raises:
-            ForbesError: where the episode broke, or the process died, three times.
+            ForbesError: if the episode fails, or the process dies, three times.
         """
         try:
             answer = self._connection.recv()
         except (EOFError, OSError) as error:
             self._process.join()
-            died = f"the process that plays episodes has died, exit code {self._process.exitcode}"
+            died = f"the process that plays episodes died, exit code {self._process.exitcode}"
             if attempts == 1:
                 raise ForbesError(
-                    f"{died}, {ATTEMPTS} times in episode {self._number}; what it said is above. Mend that, or set "
-                    "overlap to false"
+                    f"{died}, {ATTEMPTS} times in episode {self._number}. Fix the error printed above, or set overlap "
+                    "to false"
                 ) from error
-            print(f"forbes: {died}; episode {self._number} is played again", file=sys.stderr)
+            print(f"forbes: {died}; episode {self._number} is replayed", file=sys.stderr)
         else:
             if isinstance(answer, ForbesError):
                 raise answer
@@ -75,7 +75,7 @@ class EpisodeWorker:
         return self.finish(attempts - 1)
 
     def close(self) -> None:
-        """End the process, in the midst of an episode too."""
+        """End the process, even during an episode."""
         self._process.kill()
         self._process.join()
         self._connection.close()
@@ -85,12 +85,12 @@ class EpisodeWorker:
         self._process, self._connection = start_child(_serve, *self._arguments)
 
     def _ask(self) -> None:
-        with suppress(OSError):  # it has died since the last episode, which `finish` finds
+        with suppress(OSError):  # the process may have died since the last episode, which `finish` handles
             self._connection.send_bytes(self._message)
 
 
 def _serve(connection: Connection, make: Callable[[], Environment], timeout: float, time_limit: int) -> None:
-    """Run in the process: play what is asked for until the parent is gone."""
+    """Main function of the process: play the requested episodes until the parent exits."""
     torch.set_num_threads(1)
     try:
         with EnvironmentProcess(make, timeout, time_limit) as environment:

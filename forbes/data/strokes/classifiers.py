@@ -1,13 +1,13 @@
-r"""Two judges of digits: what class a finished drawing is, and what class an unfinished one will become.
+r"""Classifiers of digits: the class of a finished drawing, and the future class of an unfinished one.
 
 .. math:: \text{finished } p(y \mid o), \qquad
           \text{prefix } p\Big(y \,\Big|\, o_t, \frac1t \sum_{\tau \le t} o_\tau\Big) = p(y \mid o_{1:t})
 
-Both are small convolutional networks that were trained on strokes (`forbes data build-classifiers`) and come with the
-package in `classifiers.npz`. Frames are cumulative, so their mean over time tells when each pixel was drawn: the prefix
-classifier sees all that a model sees. It is calibrated, so that it can stand for the true distribution of the class
-given a beginning; there is one for each set of strokes, since the sets differ in the order of writing. The finished
-classifier has seen both sets, and strokes that are shifted, broken or grey, as those of a model may be.
+Both are small convolutional networks trained on strokes (`forbes data build-classifiers`) and bundled in
+`classifiers.npz`. Frames are cumulative, so their mean over time shows when each pixel was drawn: the prefix classifier
+has all the information that a model has. It is calibrated, so that it can serve as the true class distribution given a
+prefix. There is one for each set of strokes, since the sets differ in the order of writing. The finished classifier is
+trained on both sets, with strokes that are shifted, broken or grey, as those of a model may be.
 """
 
 import hashlib
@@ -37,7 +37,7 @@ __all__ += ["load_classifiers", "save_weights"]
 
 CLASSES = 10
 CLASSIFIERS_SHA256 = "814ad34e76ac09d430373f9695a8aaee6cc9fd58e5fdabe9ce6da12f6e31933f"
-"""Of the weights that come with this version."""
+"""SHA-256 of the weights of this version."""
 
 _CHANNELS = (16, 32, 64)
 _WIDTH = 64
@@ -48,8 +48,8 @@ class DigitClassifier(nn.Module):
     """Log-probabilities of the ten classes: three convolutions of stride 2 and a hidden layer.
 
     Args:
-        channels: 1 for the finished classifier, which sees a frame; 2 for the prefix classifier, which sees the last
-            frame and the mean of all.
+        channels: number of input channels: 1 for the finished classifier (a frame), 2 for the prefix classifier (the
+            last frame and the mean frame).
     """
 
     def __init__(self, channels: int) -> None:
@@ -64,7 +64,7 @@ class DigitClassifier(nn.Module):
         )
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Return log p(y | frames) in nats: grey values in [0, 1], `(*, C, H, W)`, to `(*, 10)`."""
+        """Return log p(y | frames) in nats, `(*, 10)`, for grey values in [0, 1], `(*, C, H, W)`."""
         logits: Tensor = self.net(frames.flatten(0, -4).float())  # (N, 10)
         return logits.log_softmax(-1).view(*frames.shape[:-3], CLASSES)  # (*, 10)
 
@@ -77,32 +77,34 @@ class DigitClassifiers(NamedTuple):
 
 
 def classifiers_path() -> Path:
-    """Return the path of the weights that come with the package."""
+    """Return the path of the bundled weights."""
     return bundled("classifiers.npz")
 
 
 def load_classifiers(origin: Literal["bundled", "dejong"]) -> DigitClassifiers:
-    """Read the classifiers for a set of strokes, in evaluation mode on the CPU.
+    """Load the classifiers for a set of strokes, in evaluation mode on the CPU.
 
     Raises:
-        ForbesError: where the file is missing, broken, or not the one of this version.
+        ForbesError: if the file is missing, damaged, or of another version.
     """
     path = classifiers_path()
-    remedy = "Restore it from the repository, or install forbes again"
+    remedy = "Restore it from the repository, or reinstall forbes"
     if not path.is_file():
-        raise ForbesError(f"{path}: there is no such file. {remedy}")
+        raise ForbesError(f"{path}: no such file. {remedy}")
     weights = read_npz(path, remedy)
     if (found := _sha256(weights)) != CLASSIFIERS_SHA256:
         raise ForbesError(f"{path}: weights of sha256 {found[:16]}…, expected {CLASSIFIERS_SHA256[:16]}…. {remedy}")
-    judges = DigitClassifiers(DigitClassifier(1), DigitClassifier(2))
-    for judge, name in zip(judges, ("finished", f"prefix-{origin}"), strict=True):
-        judge.load_state_dict({key: torch.from_numpy(weights[f"{name}.{key}"]).float() for key in judge.state_dict()})
-        judge.eval().requires_grad_(False)
-    return judges
+    classifiers = DigitClassifiers(DigitClassifier(1), DigitClassifier(2))
+    for classifier, name in zip(classifiers, ("finished", f"prefix-{origin}"), strict=True):
+        classifier.load_state_dict(
+            {key: torch.from_numpy(weights[f"{name}.{key}"]).float() for key in classifier.state_dict()}
+        )
+        classifier.eval().requires_grad_(False)
+    return classifiers
 
 
 def save_weights(path: Path, classifiers: Mapping[str, DigitClassifier]) -> str:
-    """Write the classifiers' weights in half precision, and give their hash."""
+    """Write the classifiers' weights in half precision, and return their hash."""
     weights = {
         f"{name}.{key}": values.numpy().astype(np.float16)
         for name, classifier in classifiers.items()
@@ -113,7 +115,7 @@ def save_weights(path: Path, classifiers: Mapping[str, DigitClassifier]) -> str:
 
 
 def _sha256(weights: Mapping[str, NDArray[Any]]) -> str:
-    """Hash names, shapes and bytes, without the file's compression."""
+    """Hash names, shapes and bytes, independent of the file's compression."""
     digest = hashlib.sha256()
     for name, array in sorted(weights.items()):
         digest.update(f"{name} {array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
@@ -121,13 +123,13 @@ def _sha256(weights: Mapping[str, NDArray[Any]]) -> str:
 
 
 def calibration_error(probabilities: Tensor, labels: Tensor) -> float:
-    r"""Measure how far confidence is from accuracy, over ten equal bins b of the confidence (ECE, arXiv 1706.04599).
+    r"""Return the expected calibration error (ECE, arXiv 1706.04599), over ten equal bins b of the confidence.
 
     .. math:: \frac1N \sum_b \Big|\sum_{i \in b} 1[\hat y_i = y_i] - \hat p_i\Big|
 
     Args:
-        probabilities: of the classes, `(N, 10)`; the largest, :math:`\hat p_i`, is the confidence of the choice
-            :math:`\hat y_i`.
+        probabilities: class probabilities, `(N, 10)`. The largest, :math:`\hat p_i`, is the confidence of the
+            prediction :math:`\hat y_i`.
         labels: true classes, `(N,)`.
     """
     confidence, choice = probabilities.double().max(1)  # (N,), (N,)

@@ -1,4 +1,4 @@
-"""How alike two stroke sets of the same digits are: in pixels, in distance, and in the order of writing."""
+"""Compare two stroke sets of the same digits: common pixels, distance, and order of writing."""
 
 from typing import NamedTuple
 
@@ -8,27 +8,27 @@ from numpy.typing import NDArray
 from forbes.data.strokes.file import SIDE, StrokeArrays
 from forbes.errors import ForbesError
 
-__all__ = ["Comparison", "compare_digits", "compare_sets"]
+__all__ = ["PathSimilarity", "compare_digits", "compare_sets"]
 
 
-class Comparison(NamedTuple):
-    """What two pen paths of one digit have in common."""
+class PathSimilarity(NamedTuple):
+    """Similarity of two pen paths of one digit."""
 
     iou: float
-    """Pixels of both over pixels of either."""
+    """Intersection over union of the visited pixels."""
     chamfer: float
-    """Distance from a pixel to the other path's nearest one, in pixels: the mean over each path's, then of the two."""
+    """Mean distance in pixels from a pixel to the nearest pixel of the other path, averaged over both directions."""
     order: float
-    """Spearman's correlation of first visits on the common pixels, up to reversal; nan with fewer than 3 of them."""
+    """Absolute Spearman correlation of first visits on the common pixels; NaN with fewer than 3 common pixels."""
 
 
-def compare_digits(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Comparison:
+def compare_digits(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> PathSimilarity:
     """Compare two paths, each uint8 (P, 2)."""
     (a, visit_a), (b, visit_b) = (np.unique(_pixel_numbers(path), return_index=True) for path in (one, other))
     common, in_a, in_b = np.intersect1d(a, b, assume_unique=True, return_indices=True)
     gap = np.stack(np.divmod(a, SIDE), -1)[:, None] - np.stack(np.divmod(b, SIDE), -1)  # (A, B, 2)
     distance = np.sqrt((gap**2).sum(-1))  # (A, B)
-    return Comparison(
+    return PathSimilarity(
         iou=len(common) / (len(a) + len(b) - len(common)),
         chamfer=float(distance.min(1).mean() + distance.min(0).mean()) / 2,
         order=_rank_correlation(visit_a[in_a], visit_b[in_b]),
@@ -40,7 +40,7 @@ def _pixel_numbers(path: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 def _rank_correlation(one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
-    """Spearman's correlation of values without ties, ρ = 1 − 6 Σ d² / (n³ − n), up to sign."""
+    """Return the absolute Spearman correlation of values without ties, |1 − 6 Σ d² / (n³ − n)|."""
     n = len(one)
     if n < 3:
         return float("nan")
@@ -52,7 +52,7 @@ def compare_sets(one: StrokeArrays, other: StrokeArrays) -> dict[str, tuple[floa
     """Compare two sets of the same digits.
 
     Returns:
-        For each measure its value, or the two sets' values.
+        The value of each measure, or one value per set.
     """
     if not np.array_equal(one.labels, other.labels):
         raise ForbesError("the two sets have different labels, expected the same digits in the same order.")
@@ -65,7 +65,7 @@ def compare_sets(one: StrokeArrays, other: StrokeArrays) -> dict[str, tuple[floa
         "Chamfer distance in pixels, mean": (float(scores[:, 1].mean()),),
         "order correlation, mean": (float(np.nanmean(scores[:, 2])),),
         "order correlation, median": (float(np.nanmedian(scores[:, 2])),),
-        "points a digit, median": tuple(float(np.median(length)) for length in lengths),
-        "points a digit, mean": tuple(float(length.mean()) for length in lengths),
-        "strokes a digit, mean": tuple(float(arrays.pen_up.sum() / len(arrays.labels)) for arrays in sets),
+        "points per digit, median": tuple(float(np.median(length)) for length in lengths),
+        "points per digit, mean": tuple(float(length.mean()) for length in lengths),
+        "strokes per digit, mean": tuple(float(arrays.pen_up.sum() / len(arrays.labels)) for arrays in sets),
     }

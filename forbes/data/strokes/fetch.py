@@ -1,4 +1,4 @@
-"""Get the paper's stroke set: download it, or take a local copy, and convert it to a stroke file."""
+"""Download the paper's stroke set, or use a local copy, and convert it to a stroke file."""
 
 import gzip
 import tarfile
@@ -29,18 +29,18 @@ DEJONG_URL = "https://github.com/edwin-de-jong/mnist-digits-stroke-sequence-data
 DEJONG_BLOB = "33b359bd06060e7e98abffaf74470f0b7310d12b"
 DIGITS = {"train": 60_000, "test": 10_000}
 
-_LOCAL = "Give a local copy with: forbes data fetch strokes --from PATH, or use the origin bundled, which needs none"
-_ARCHIVE_LIMIT = 2**30  # bytes when unpacked; 210,000 small files and their tar headers have less than half
-_DIGIT_LIMIT = 2**14  # bytes of one digit's rows; the longest, of 106 points, has less than 2,000
-_LABELS_LIMIT = 2**20  # bytes; 60,000 lines of one digit
+_LOCAL = "Give a local copy with: forbes data fetch strokes --from PATH, or use the bundled origin"
+_ARCHIVE_LIMIT = 2**30  # bytes when unpacked; the 210,000 small files and their tar headers have less than half
+_DIGIT_LIMIT = 2**14  # bytes of one digit's rows; the longest digit, of 106 points, has less than 2,000
+_LABELS_LIMIT = 2**20  # bytes; 60,000 lines of one character
 
 
 def fetch_dejong(source: Path | None, destination: Path) -> None:
-    """Store the paper's set as a stroke file, verified.
+    """Download or read the paper's set, verify it, and store it as a stroke file.
 
     Args:
-        source: The tarball, its extracted folder or a converted `.npz`; None downloads the tarball.
-        destination: The stroke file to write; a download is kept beside it until it is converted.
+        source: tarball, its extracted folder or a converted `.npz`; None downloads the tarball.
+        destination: stroke file to write. A download is stored in the same folder until it is converted.
     """
     if source is not None:
         splits = _read(source)
@@ -50,7 +50,7 @@ def fetch_dejong(source: Path | None, destination: Path) -> None:
         try:
             splits = _read(tarball)
         finally:
-            tarball.unlink()  # if it is wrong now, it stays wrong
+            tarball.unlink()  # a wrong file would not get better by resuming the download
     verify_dejong(splits, source or destination, _LOCAL)
     save_strokes(destination, splits)
 
@@ -60,7 +60,7 @@ def _read(source: Path) -> dict[str, StrokeArrays]:
     if source.is_dir():
         return convert(read_folder(source, wanted), DIGITS, source)
     if not source.is_file():
-        raise ForbesError(f"{source}: there is no such file or folder. {_LOCAL}")
+        raise ForbesError(f"{source}: no such file or folder. {_LOCAL}")
     if source.suffix == ".npz":
         return load_strokes(source, _LOCAL)
     found = git_blob_id(source)
@@ -70,7 +70,7 @@ def _read(source: Path) -> dict[str, StrokeArrays]:
 
 
 def wanted_files(digits: Mapping[str, int]) -> dict[str, int]:
-    """Name the files that hold so many digits of each split, with the most bytes each may have."""
+    """Return the names of the files for the given number of digits of each split, with their maximal size in bytes."""
     wanted = {f"{split}labels.txt": _LABELS_LIMIT for split in digits}
     for split, number in digits.items():
         wanted |= {f"{split}img-{digit}-inputdata.txt": _DIGIT_LIMIT for digit in range(number)}
@@ -91,10 +91,10 @@ def read_folder(folder: Path, wanted: Mapping[str, int]) -> Iterator[tuple[str, 
 
 
 def read_archive(path: Path, wanted: Mapping[str, int]) -> Iterator[tuple[str, bytes]]:
-    """Read members of the tarball by their exact names, in one pass over the stream; nothing is extracted.
+    """Read members of the tarball by their exact names, in one pass over the stream. Nothing is extracted.
 
-    An archive with anything but plain files and folders under relative names, with a wanted member twice or too
-    large, or that unpacks to more than a gigabyte is refused.
+    An archive is refused if it has other members than plain files and folders with relative names, if a wanted member
+    is duplicate or too large, or if it unpacks to more than a gigabyte.
     """
     seen: set[str] = set()
     try:
@@ -103,12 +103,12 @@ def read_archive(path: Path, wanted: Mapping[str, int]) -> Iterator[tuple[str, b
                 parts = PurePosixPath(member.name).parts
                 if not (member.isreg() or member.isdir()) or ".." in parts or "/" in parts:
                     raise ForbesError(
-                        f"{path}: {member.name} is a link or leads outside, expected plain files. {_LOCAL}"
+                        f"{path}: {member.name} is a link or points outside, expected plain files. {_LOCAL}"
                     )
                 if parts[:-1] != ("sequences",) or parts[-1] not in wanted:
                     continue
                 if parts[-1] in seen:
-                    raise ForbesError(f"{path}: {member.name} is there twice, expected once. {_LOCAL}")
+                    raise ForbesError(f"{path}: {member.name} occurs twice, expected once. {_LOCAL}")
                 seen.add(parts[-1])
                 _check_size(member.size, wanted[parts[-1]], f"{path}: {member.name}")
                 content = archive.extractfile(member)
@@ -119,7 +119,7 @@ def read_archive(path: Path, wanted: Mapping[str, int]) -> Iterator[tuple[str, b
 
 
 class _BoundedGzip(gzip.GzipFile):
-    """A gzipped stream that ends in an error where a bomb would go on."""
+    """A gzipped stream that raises an error beyond a size limit, against zip bombs."""
 
     def read(self, size: int | None = -1) -> bytes:
         """Read unpacked bytes."""
@@ -134,7 +134,7 @@ def _check_size(size: int, limit: int, where: Path | str) -> None:
 
 
 def convert(files: Iterable[tuple[str, bytes]], digits: Mapping[str, int], where: Path) -> dict[str, StrokeArrays]:
-    """Put the text files of so many digits of each split, in any order, together as arrays."""
+    """Convert the text files, in any order, of the given number of digits of each split to arrays."""
     wanted = wanted_files(digits)
     paths: dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]] = {}
     labels: dict[str, NDArray[np.uint8]] = {}
@@ -161,4 +161,4 @@ def _parse_labels(content: bytes, where: str) -> NDArray[np.uint8]:
     try:
         return np.array(content.split(), dtype=np.uint8)
     except (ValueError, OverflowError) as error:
-        raise ForbesError(f"{where}: a label is no number ({error}), expected digits 0 to 9. {_LOCAL}") from error
+        raise ForbesError(f"{where}: a label is not a number ({error}), expected digits 0 to 9. {_LOCAL}") from error

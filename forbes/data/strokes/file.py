@@ -1,4 +1,4 @@
-"""The stroke file: pen paths of digits in one `.npz`, checked on the way in and reproducible on the way out.
+"""The stroke file: pen paths of digits in one `.npz`, validated when read and reproducible when written.
 
 For each split ``S`` in ``train``, ``test``:
 
@@ -30,7 +30,7 @@ __all__ = ["SIDE", "StrokeArrays", "check_strokes", "load_strokes", "save_stroke
 SIDE = 28
 """Height and width of a digit's image in pixels."""
 
-_MEMBER_LIMIT = 64 * 2**20  # bytes of one array; the largest of the two known sets has 5 MB
+_MEMBER_LIMIT = 64 * 2**20  # bytes of one array; the largest in the two known sets has 5 MB
 
 
 @printed_by_shape
@@ -59,14 +59,14 @@ def load_strokes(path: Path, remedy: str) -> dict[str, StrokeArrays]:
     """Read and check a stroke file.
 
     Args:
-        path: The `.npz` file.
-        remedy: What the user can do about a file that is missing or broken; the error's last sentence.
+        path: the `.npz` file.
+        remedy: what to do if the file is missing or damaged; the last sentence of the error message.
 
     Returns:
-        The arrays of the splits ``train`` and ``test``.
+        Arrays of the splits `train` and `test`.
     """
     if not path.is_file():
-        raise ForbesError(f"{path}: there is no such file. {remedy}")
+        raise ForbesError(f"{path}: no such file. {remedy}")
     with readable(path, "a stroke file", remedy), zipfile.ZipFile(path) as archive:
         splits = {
             split: StrokeArrays(*(_read_array(archive, path, f"{split}_{name}", remedy) for name in _EXPECTED))
@@ -86,7 +86,7 @@ def _read_array(archive: zipfile.ZipFile, path: Path, name: str, remedy: str) ->
 
 
 def check_strokes(splits: Mapping[str, StrokeArrays], where: Path, remedy: str) -> None:
-    """Raise a `ForbesError` unless every array is what the format says."""
+    """Raise a `ForbesError` unless every array conforms to the format."""
     for split, arrays in splits.items():
         for name, array in arrays._asdict().items():
             dtype, shape, dimensions = _EXPECTED[name]
@@ -103,14 +103,14 @@ def check_strokes(splits: Mapping[str, StrokeArrays], where: Path, remedy: str) 
 def _find_problem(arrays: StrokeArrays) -> str | None:
     points, pen_up, offsets, labels = arrays
     if len(pen_up) != len(points):
-        return f"pen_up has {len(pen_up)} entries, expected one for each of {len(points)} points"
+        return f"pen_up has {len(pen_up)} entries, expected one per point, {len(points)}"
     if len(offsets) != len(labels) + 1:
         return f"offsets has {len(offsets)} entries, expected one more than the {len(labels)} labels"
     if offsets[0] != 0 or offsets[-1] != len(points):
         return f"offsets run from {offsets[0]} to {offsets[-1]}, expected 0 to {len(points)}, the number of points"
     empty = np.flatnonzero(np.diff(offsets) <= 0)
     if len(empty):
-        return f"offsets do not increase at digit {empty[0]}, expected at least one point a digit"
+        return f"offsets do not increase at digit {empty[0]}, expected at least one point per digit"
     if len(points) and points.max() >= SIDE:
         return f"a point has coordinate {points.max()}, expected 0 to {SIDE - 1}"
     if not pen_up[offsets[1:] - 1].all():
@@ -121,14 +121,14 @@ def _find_problem(arrays: StrokeArrays) -> str | None:
 
 
 def save_strokes(path: Path, splits: Mapping[str, StrokeArrays]) -> None:
-    """Write a stroke file whose bytes depend on the arrays alone; a reader never sees half of it."""
+    """Write a stroke file atomically. Its bytes depend only on the arrays."""
     check_strokes(splits, path, "Nothing was written")
     arrays = {f"{split}_{name}": array for split, arrays in splits.items() for name, array in arrays._asdict().items()}
     replace_file(path, npz_bytes(arrays))
 
 
 def sha256_of_arrays(splits: Mapping[str, StrokeArrays]) -> dict[str, str]:
-    """Hash each array's bytes, without header or compression: ``{"train_points": "21c5…", …}``."""
+    """Hash the bytes of each array, without header or compression: `{"train_points": "21c5…", …}`."""
     return {
         f"{split}_{name}": hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
         for split, arrays in splits.items()

@@ -1,4 +1,4 @@
-"""Sequential MNIST: a digit appears as a pen writes it, frame t showing the first t points of its path."""
+"""Sequential MNIST: digits as a pen writes them. Frame t shows the first t points of the path."""
 
 import hashlib
 from functools import cached_property
@@ -13,6 +13,7 @@ from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.strokes.dejong import dejong_path, verify_dejong
 from forbes.data.strokes.file import SIDE, StrokeArrays, load_strokes, sha256_of_arrays
 from forbes.errors import ForbesError, require_at_least
+from forbes.rounding import ceil_div
 from forbes.shapes import printed_by_shape
 
 __all__ = ["StrokePoints", "Strokes", "bundled_path"]
@@ -25,20 +26,20 @@ class StrokePoints(NamedTuple):
     points: Tensor
     """Pixels (x, y) in writing order, the last one repeated as padding, uint8 (B, T * points_per_step, 2)."""
     number: Tensor
-    """Points that are no padding, int64 (B,)."""
+    """Number of points without padding, int64 (B,)."""
 
 
 def bundled_path() -> Path:
-    """Return the path of the set that comes with the package."""
+    """Return the path of the bundled set."""
     return bundled("strokes.npz")
 
 
 class Strokes(SequenceSource):
     r"""MNIST digits as they are written, rendered on the fly from the pen's path.
 
-    With k points a step, step t adds the points :math:`k(t-1)+1, …, \min(kt, n)` of the digit's n points. A whole
-    frame shows all pixels visited so far, a written frame those that step t has visited first. Both are binary, and
-    one is a bijection of the other, so the log-probability of a sequence is the same for both:
+    With k points per step, step t adds the points :math:`k(t-1)+1, …, \min(kt, n)` of the digit's n points. A `whole`
+    frame shows all pixels visited so far, a `written` frame those first visited at step t. Both are binary and related
+    by a bijection, so the log-probability of a sequence is the same for both:
 
     .. math:: w_t = x_t - x_{t-1}, \qquad x_t = \sum_{u \le t} w_u, \qquad x_0 = 0
 
@@ -50,20 +51,21 @@ class Strokes(SequenceSource):
                          mask     true  true  true  false
 
     Args:
-        origin: ``bundled``, our own extraction from the MNIST images, comes with the package; ``dejong`` is the
-            paper's set, stored by ``forbes data fetch strokes``.
-        path: Read this file instead of the origin's own.
-        points_per_step: Points that each frame adds. 1 is the paper's; 2 shows 99 % of the digits whole in 30 frames.
-        validation: The last so many training digits are the validation split.
-        frames: ``written``, what each step adds: at one point a step one pixel, or none where the pen crosses its own
-            path. ``whole``, the paper's, show the first t points; their likelihood is mostly that of the past, drawn
-            again.
+        origin: `bundled`, our own extraction from the MNIST images, which comes with the package; or `dejong`, the
+            paper's set, stored by `forbes data fetch strokes`.
+        path: stroke file to read instead of the origin's.
+        points_per_step: number of points that each frame adds, 1 in the paper. With 2, 30 frames show 99 % of the
+            digits to the end.
+        validation: number of training digits, at the end of the split, that form the validation split.
+        frames: `written` frames have the pixels added at each step: with one point per step one pixel, or none where
+            the pen crosses its path. `whole` frames, as in the paper, show the first t points; most of their likelihood
+            is that of redrawing past frames.
 
     Example:
         >>> source = forbes.Strokes(frames="whole")
         >>> source.size("test"), source.observation_shape
         (10000, (1, 28, 28))
-        >>> source.steps("test")[:3]  # until each digit is whole
+        >>> source.steps("test")[:3]  # length of each digit
         tensor([29, 37, 19])
     """
 
@@ -89,12 +91,12 @@ class Strokes(SequenceSource):
 
     @cached_property
     def _splits(self) -> dict[Split, StrokeArrays]:
-        """The file's arrays by split, read on first use."""
+        """Arrays of the file by split, read on first use."""
         if self.origin == "bundled":
             path, remedy = bundled_path(), "Rebuild it with: forbes data build-strokes --images DIR"
         else:
             path = dejong_path()
-            remedy = "Get it with: forbes data fetch strokes --from PATH, or use the origin bundled"
+            remedy = "Get it with: forbes data fetch strokes --from PATH, or use the bundled origin"
         path = Path(self.path) if self.path else path
         file = load_strokes(path, remedy)
         if self.origin == "dejong":
@@ -119,11 +121,11 @@ class Strokes(SequenceSource):
         return hashlib.sha256(" ".join(hashes.values()).encode()).hexdigest()
 
     def size(self, split: Split) -> int:
-        """Count the digits of a split."""
+        """Return the number of digits of a split."""
         return len(self._splits[split].labels)
 
     def arrays(self, split: Split) -> StrokeArrays:
-        """Return a split's pen paths, pen lifts included."""
+        """Return the pen paths of a split, including pen lifts."""
         return self._splits[split]
 
     def labels(self, split: Split) -> Tensor:
@@ -131,12 +133,12 @@ class Strokes(SequenceSource):
         return torch.from_numpy(self._splits[split].labels).long()
 
     def steps(self, split: Split) -> Tensor:
-        """Count the steps of each digit of a split until it is whole, int64 (N,)."""
+        """Return the number of steps of each digit of a split, int64 (N,)."""
         points = self._tensors[split][1].diff()  # (N,)
-        return -(-points // self.points_per_step)
+        return ceil_div(points, self.points_per_step)
 
     def gather(self, split: Split, index: Tensor, length: int) -> StrokePoints:
-        """Collect the paths of digits `index`, int64 (B,), cut or padded to `length` steps."""
+        """Return the paths of digits by index, int64 (B,), cut or padded to `length` steps."""
         require_at_least(1, "Strokes", length=length)
         points, offsets = self._tensors[split]
         first = offsets[index]  # (B,)
@@ -146,9 +148,9 @@ class Strokes(SequenceSource):
         return StrokePoints(points[first[:, None] + step], number)  # (B, P, 2), (B,)
 
     def decode(self, compact: StrokePoints) -> SequenceBatch:
-        """Render frames from points, on the device the points lie on.
+        """Render frames from points, on their device.
 
-        A pixel is written at its first visit and on from there, so one comparison of first visits with t gives all.
+        A pixel is on from its first visit, so all frames result from one comparison of first visits with t.
         """
         points, number = compact
         batch, device = len(points), points.device
@@ -171,7 +173,7 @@ class Strokes(SequenceSource):
 
 
 def _divide(arrays: StrokeArrays, digits: int) -> tuple[StrokeArrays, StrokeArrays]:
-    """Part the first so many digits from the others."""
+    """Split off the first `digits` digits."""
     points, pen_up, offsets, labels = arrays
     cut = offsets[digits]
     return (

@@ -1,1 +1,1 @@
-"""Calibration: whether a belief is as certain as it should be."""
+"""Calibration: is a belief as certain as it should be?"""

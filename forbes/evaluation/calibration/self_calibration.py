@@ -1,9 +1,9 @@
-r"""Is the filter the exact one of the model's own process? A check of any trained model, without ground truth.
+r"""Self-calibration: is the filter of a trained model exact for the model's own process? Needs no ground truth.
 
-Draw :math:`(s, o)` from the model's prior, run the filter on o, and rank the drawn :math:`s_t` among samples of the
-belief :math:`q(s_t \mid o_{1:t})`. The ranks are uniform if the belief is the exact filtering posterior of the model
-(simulation-based calibration, Talts et al., 2018, arXiv 1804.06788). A filter that was trained by the ELBO is expected
-to fail: its beliefs are too narrow (`forbes theorem`), and the ranks pile up at both ends.
+Sample :math:`(s, o)` from the model's prior, filter o, and rank the sampled :math:`s_t` among samples of the belief
+:math:`q(s_t \mid o_{1:t})`. The ranks are uniform if the belief is the exact filtering posterior of the model
+(simulation-based calibration, Talts et al., 2018, arXiv 1804.06788). A filter trained with the ELBO is expected to
+fail: its beliefs are too narrow (`forbes theorem`), and the ranks pile up at both ends.
 """
 
 from typing import NamedTuple
@@ -14,25 +14,26 @@ from torch import Tensor
 from forbes.evaluation.calibration.ranks import TwoSampleTest, ranks, tarp_ranks, two_sample_test
 from forbes.evaluation.scores import LogMeanExp
 from forbes.models import EncodedSequence, StateSpaceModel
-from forbes.seeding import derive_seed, generator
+from forbes.seeding import derive_seed, forked, generator
 
 __all__ = ["SelfCalibration", "self_calibration"]
 
 _COMPONENTS = 20
-"""Posterior trajectories whose mixture estimates the belief's density; any function of (s, o) has uniform ranks."""
+"""Number of posterior trajectories in the mixture that estimates the belief's density. The ranks are uniform for any
+function of (s, o), so also for this estimate."""
 
 
 class SelfCalibration(NamedTuple):
-    """Ranks of N drawn states among L samples of their beliefs, 0 to L."""
+    """Ranks of N sampled states among L samples of their beliefs, 0 to L."""
 
     value: Tensor
-    """Of each dimension of s_t, `(N, D)`."""
+    """Rank of each dimension of s_t, `(N, D)`."""
     density: Tensor
-    """Of the belief's log-density, the mixture over posterior trajectories, `(N,)`."""
+    """Rank of the belief's log-density, estimated as a mixture over posterior trajectories, `(N,)`."""
     tarp: Tensor
-    """Of the distance from a random point, `(N,)`."""
+    """Rank of the distance from a random point, `(N,)`."""
     classifier: TwoSampleTest
-    """Tells the drawn state from one sample of its belief, given the mean of the others."""
+    """Test that separates the sampled state from one sample of its belief, given the mean of the others."""
 
 
 @torch.no_grad()
@@ -40,14 +41,12 @@ def self_calibration(model: StateSpaceModel, action: Tensor, samples: int, seed:
     """Rank the last state of each sequence that the model imagines.
 
     Args:
-        model: in eval mode, on the action's device.
-        action: a_{t-1} of N sequences up to the step that is checked, `(N, t, A)`.
-        samples: L, of each belief; each from a draw of the belief of its own, since the belief is over (h, s).
-        seed: of everything that is drawn.
+        model: model in eval mode, on the action's device.
+        action: actions of N sequences up to the step that is checked, `(N, t, A)`.
+        samples: number of samples per belief, L. Each uses its own trajectory, since the belief is over (h, s).
+        seed: random seed for all samples.
     """
-    devices = [action.device] if action.device.type == "cuda" else []
-    with torch.random.fork_rng(devices):
-        torch.manual_seed(derive_seed(seed, "self-calibration", 0))
+    with forked(action.device, derive_seed(seed, "self-calibration", 0)):
         rollout = model.imagine(model.initial(len(action)), action)
         observation = model.likelihood.sample(model.decode(rollout.features))  # (N, t, *O)
         encoded = EncodedSequence(observation, model.embed_target(observation), action)

@@ -1,1 +1,1 @@
-"""Completions of digits: whether they are digits, and whether they are as diverse as they should be."""
+"""Evaluate completions of digits: are they digits, and are they as diverse as they should be?"""

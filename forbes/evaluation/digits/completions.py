@@ -1,15 +1,14 @@
-r"""Are predictions of digits precise yet diverse, with no two modes mixed in one? Completions, read by classifiers.
+r"""Score completions of digits with classifiers: are they precise yet diverse, without mixing two modes in one?
 
 A model sees the first c steps of a digit and completes it N times, :math:`x^k_{c+1:T}`, each on its own trajectory
-(`complete`). A completion is read at the step n at which the true digit ends: models are trained up to there only and
-learn no sign of the end, so at a later step they would have drawn on. With the classifiers of
-`forbes.data.strokes.classifiers`:
+(`complete`). Completions are classified at the step n at which the true digit ends: models are trained up to there and
+learn no sign of the end, so later they would keep drawing. With the classifiers of `forbes.data.strokes.classifiers`:
 
 .. math:: p(y \mid o_{1:c}) = \frac1N \sum_k p_{\text{finished}}(y \mid x^k_n)
           \qquad\text{against}\qquad r(y \mid o_{1:c}) = p_{\text{prefix}}(y \mid o_{1:c})
 
-Of written strokes a completion is a drawing, one pixel a step; of whole frames it is a picture in grey. Grey values are
-read as they are; where a score is about observations, those are drawn from them pixel by pixel.
+For written strokes a completion is a binary drawing, one pixel per step; for whole frames it is a grey image. The
+classifiers read grey values as they are. Scores of observations sample binary pixels from them.
 """
 
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ from torch import Tensor
 from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
 from forbes.data.strokes.classifiers import DigitClassifier, DigitClassifiers
 from forbes.errors import ForbesError
-from forbes.evaluation.digits.neighbours import Beginnings, mean_frame
+from forbes.evaluation.digits.neighbours import TrainingPrefixes, mean_frame
 from forbes.evaluation.digits.scores import (
     average_of,
     best_of,
@@ -37,16 +36,17 @@ from forbes.evaluation.scores import Increments
 from forbes.evaluation.scoring import Scorer
 from forbes.models import BeliefModel
 
-__all__ = ["Prefixes", "model_pass", "neighbour_pass", "prefixes", "score_completions", "summarise"]
-__all__ += ["summarise_classes", "truth_pass"]
+__all__ = ["Prefixes", "model_scorer", "neighbour_scorer", "score_completions", "select_prefixes", "summarise"]
+__all__ += ["summarise_classes", "truth_scorer"]
 
 _SHARES = (60, 80)
-"""Per cent of the rest after which a completion's class is compared with its last."""
+"""Percentages of the remaining steps after which a completion's class is compared with its final class."""
 _CLEAR = 0.9
-"""Of 100 true digits 95 are above, of 100 equal blends of two classes 11 (`data/README.md`)."""
+"""Probability above which a digit is clear: 95 % of true digits are, and 11 % of equal blends of two classes
+(`data/README.md`)."""
 _MASS = 0.05
-_ROWS = 2  # digits at a time: with a hundred completions, ten at once take a quarter more time for each
-_TRUTHS = 2  # copies of the truth in place of completions: the fewest that the scores are defined for
+_ROWS = 2  # digits per batch: with a hundred completions each, batches of ten take a quarter more time per digit
+_TRUTHS = 2  # copies of the truth in place of completions: the fewest for which the scores are defined
 _READINGS = (
     *("classes", "clear", "grey", "energy trained", "crps trained", "energy end", "crps end", "best", "average"),
     *(f"{name} {share}" for share in _SHARES for name in ("early", "kept")),
@@ -54,30 +54,32 @@ _READINGS = (
 
 
 class Prefixes(NamedTuple):
-    """The beginnings of some digits: those that go on after c steps, in the order of their length."""
+    """The first c steps of the digits that continue after c steps, sorted by length."""
 
     context: int
-    """c."""
+    """Number of steps of the prefix, c."""
     digits: Tensor
-    """Which of their split, int64 (B,)."""
+    """Index of each digit in its split, int64 (B,)."""
     steps: Tensor
-    """n, after which each is whole, int64 (B,)."""
+    """Length of each digit, n, int64 (B,)."""
     labels: Tensor
-    """int64 (B,)."""
+    """Class of each digit, int64 (B,)."""
     reference: Tensor
-    """r(y | o_1:c), float64 (B, 10)."""
+    """Class probabilities given the prefix, r(y | o_1:c), float64 (B, 10)."""
 
     def batches(self, data: SequenceDataModule, split: Split) -> Iterator[tuple[int, SequenceBatch]]:
-        """Return the digits to their end, some at a time, with the place of the first."""
-        for place in torch.arange(len(self.digits)).split(_ROWS):
-            yield int(place[0]), data.sequences(split, self.digits[place], int(self.steps.max()))
+        """Yield the whole digits in batches, with the position of the first."""
+        for rows in torch.arange(len(self.digits)).split(_ROWS):
+            yield int(rows[0]), data.sequences(split, self.digits[rows], int(self.steps.max()))
 
 
-def prefixes(data: SequenceDataModule, split: Split, digits: int, context: int, judge: DigitClassifier) -> Prefixes:
-    """Take those of the first so many digits of a split that go on after `context` steps.
+def select_prefixes(
+    data: SequenceDataModule, split: Split, digits: int, context: int, classifier: DigitClassifier
+) -> Prefixes:
+    """Return the prefixes of those of the first `digits` digits of a split that continue after `context` steps.
 
     Raises:
-        ForbesError: where fewer than two do.
+        ForbesError: if there are fewer than two.
     """
     assert isinstance(data.source, Strokes)
     steps = data.source.steps(split)[:digits]
@@ -85,98 +87,99 @@ def prefixes(data: SequenceDataModule, split: Split, digits: int, context: int, 
     index = order[steps[order] > context]  # (B,)
     if len(index) < 2:
         raise ForbesError(
-            f"--prefixes {context}: of {digits} digits {len(index)} go on after {context} steps, expected at least 2. "
-            "Choose a smaller prefix, or more digits"
+            f"--prefixes {context}: of {digits} digits {len(index)} continue after {context} steps, expected at least "
+            "2. Choose a smaller prefix, or more digits"
         )
     observation = data.source.pictures(data.sequences(split, index, context).observation)
-    reference = judge(_history(last=observation[:, -1].float(), mean=mean_frame(observation))).double().exp()
+    reference = classifier(_history(last=observation[:, -1].float(), mean=mean_frame(observation))).double().exp()
     return Prefixes(context, index, steps[index], data.source.labels(split)[index], reference)
 
 
 def _history(last: Tensor, mean: Tensor) -> Tensor:
-    """Join what a prefix classifier sees, `(*, 1, H, W)` twice to `(*, 2, H, W)`."""
+    """Return the input of a prefix classifier: last and mean frame, each `(*, 1, H, W)`, as `(*, 2, H, W)`."""
     return torch.cat((last, mean), -3)
 
 
-def model_pass(data: SequenceDataModule, context: int, samples: int, judges: DigitClassifiers) -> Scorer:
-    """Read a model's N completions.
+def model_scorer(data: SequenceDataModule, context: int, samples: int, classifiers: DigitClassifiers) -> Scorer:
+    """Return the scorer of a model's N completions.
 
     Args:
-        data: of strokes, up to whose length models were trained.
-        context: c.
-        samples: N, at least 2.
-        judges: the classifiers.
+        data: data module of strokes, of the length that models were trained with.
+        context: number of steps that the model sees, c.
+        samples: number of completions, N, at least 2.
+        classifiers: classifiers of the digits.
     """
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _to_the_end(batch)
         frames = complete(model, data.source, batch, context, samples).frames  # (N, B, T - c, 1, H, W)
-        return score_completions(frames, _pictures(data, batch), context, data.length, judges)
+        return score_completions(frames, _pictures(data, batch), context, data.length, classifiers)
 
     return Scorer(_READINGS, f"c={context},N={samples}", function, _ROWS)
 
 
-def truth_pass(data: SequenceDataModule, context: int, judges: DigitClassifiers) -> Scorer:
-    """Read the true digits as if they were the completions: they bound what concerns one completion alone."""
+def truth_scorer(data: SequenceDataModule, context: int, classifiers: DigitClassifiers) -> Scorer:
+    """Return the scorer of the true digits as completions, a bound for the scores of single completions."""
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _pictures(data, _to_the_end(batch))
         frames = batch.observation[:, context:].float().expand(_TRUTHS, -1, -1, -1, -1, -1)
-        return score_completions(frames, batch, context, data.length, judges)
+        return score_completions(frames, batch, context, data.length, classifiers)
 
     return Scorer(_READINGS, f"c={context},N={_TRUTHS}", function, _ROWS)
 
 
-def neighbour_pass(data: SequenceDataModule, context: int, samples: int, judges: DigitClassifiers) -> Scorer:
-    """Read, as completions, the N training digits that begin most alike: real digits, and a choice of them."""
-    beginnings = Beginnings(data, context, mean_frame)
+def neighbour_scorer(data: SequenceDataModule, context: int, samples: int, classifiers: DigitClassifiers) -> Scorer:
+    """Return the scorer of the N training digits with the most similar beginnings as completions."""
+    training = TrainingPrefixes(data, context, mean_frame)
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _pictures(data, _to_the_end(batch))
-        nearest = beginnings.nearest(batch.observation[:, :context], samples)  # (B, N)
+        nearest = training.nearest(batch.observation[:, :context], samples)  # (B, N)
         others = data.sequences("train", nearest.T.flatten(), batch.observation.shape[1]).observation
         frames = data.source.pictures(others)[:, context:].float().unflatten(0, (-1, len(nearest)))  # (N, B, T - c, …)
-        return score_completions(frames, batch, context, data.length, judges)
+        return score_completions(frames, batch, context, data.length, classifiers)
 
     return Scorer(_READINGS, f"c={context},N={samples}", function, _ROWS)
 
 
 def _to_the_end(batch: SequenceBatch) -> SequenceBatch:
-    """Cut digits at the end of the longest of them."""
+    """Cut a batch at the end of its longest digit."""
     longest = int(batch.mask.sum(1).max())
-    return SequenceBatch(*(values[:, :longest] for values in batch))  # (B, longest, ...)
+    return batch.first(longest)  # (B, longest, ...)
 
 
 def _pictures(data: SequenceDataModule, batch: SequenceBatch) -> SequenceBatch:
-    """Put pictures in the place of observations."""
+    """Replace observations by cumulative images."""
     return batch._replace(observation=data.source.pictures(batch.observation))
 
 
 @torch.no_grad()
 def score_completions(
-    frames: Tensor, batch: SequenceBatch, context: int, length: int, judges: DigitClassifiers
+    frames: Tensor, batch: SequenceBatch, context: int, length: int, classifiers: DigitClassifiers
 ) -> dict[str, Tensor]:
-    """Read N completions of each of B digits.
+    """Score N completions of each of B digits.
 
     Args:
         frames: grey values of steps c + 1 … T, `(N, B, T - c, 1, H, W)`.
-        batch: the true digits as pictures, T steps.
-        context: c.
-        length: steps up to which models were trained; pixels are scored there too, or at the end if that comes first.
-        judges: the classifiers.
+        batch: true digits as cumulative images, T steps.
+        context: number of steps that the model saw, c.
+        length: training length of the models. Pixels are also scored at this step, or at the end if that is earlier.
+        classifiers: classifiers of the digits.
 
     Returns:
-        For each digit, in float64: `classes`, the distribution p, `(B, 10)`; the share of `clear` digits, and `grey`,
-        `(B, 1)`; the share that is clear `early`, after part of the rest, and of those that have `kept` their class to
-        the end, `(B, 1)`; `energy` and `crps`, `(B, 1)`; the curves `best` and `average`, `(B, N)`.
+        Values per digit, in float64: `classes`, the distribution p, `(B, 10)`; the fraction of `clear` digits, and
+        `grey`, `(B, 1)`; the fraction that is clear `early`, after part of the remaining steps, and of those that
+        `kept` their class to the end, `(B, 1)`; `energy` and `crps`, `(B, 1)`; the curves `best` and `average`,
+        `(B, N)`.
     """
     end = batch.mask.sum(1)  # (B,)
     means, truth = _pixels(frames, batch, context, end)  # (N, B, P), (B, P)
-    classes = judges.finished(means.view(*means.shape[:2], *frames.shape[3:])).double().exp()  # (N, B, 10)
+    classes = classifiers.finished(means.view(*means.shape[:2], *frames.shape[3:])).double().exp()  # (N, B, 10)
     values = {"clear": _is_clear(classes).mean(0), "grey": grey_ink(means).mean(0)}
     for share in _SHARES:
         step = context + (share * (end - context) / 100).ceil().long()  # (B,)
-        before = _classes_at(frames, batch, context, step, judges.prefix)  # (N, B, 10)
+        before = _classes_at(frames, batch, context, step, classifiers.prefix)  # (N, B, 10)
         early, same = _is_clear(before), before.argmax(-1) == classes.argmax(-1)  # (N, B), (N, B)
         values |= {f"early {share}": early.mean(0), f"kept {share}": (early * same).mean(0)}
     for name, step in (("trained", end.clamp(max=length)), ("end", end)):
@@ -188,7 +191,7 @@ def score_completions(
 
 
 def _pixels(frames: Tensor, batch: SequenceBatch, context: int, step: Tensor) -> tuple[Tensor, Tensor]:
-    """Return completions and truth at a step of each digit, counted from 1, `(B,)`: `(N, B, P)` and `(B, P)`."""
+    """Return completions, `(N, B, P)`, and truth, `(B, P)`, at one step of each digit, counted from 1, `(B,)`."""
     digit = torch.arange(len(step))
     return frames[:, digit, step - context - 1].flatten(2), batch.observation[digit, step - 1].float().flatten(1)
 
@@ -197,19 +200,21 @@ def _is_clear(classes: Tensor) -> Tensor:
     return (classes.amax(-1) > _CLEAR).double()  # (N, B)
 
 
-def _classes_at(frames: Tensor, batch: SequenceBatch, context: int, step: Tensor, judge: DigitClassifier) -> Tensor:
-    """Classify what each completion has drawn up to a step of each digit, `(B,)`, as unfinished, `(N, B, 10)`."""
+def _classes_at(
+    frames: Tensor, batch: SequenceBatch, context: int, step: Tensor, classifier: DigitClassifier
+) -> Tensor:
+    """Classify each completion up to one step of each digit, `(B,)`, as an unfinished digit: `(N, B, 10)`."""
     drawn = torch.arange(context + 1, context + 1 + frames.shape[2]) <= step[:, None]  # (B, T - c)
     rolled = drawn[:, None].to(frames.dtype) @ frames.flatten(3)  # (N, B, 1, P), the sum over the steps drawn
     total = rolled.view(*frames.shape[:2], *frames.shape[3:]) + batch.observation[:, :context].sum(1)
     mean = total / step.view(-1, 1, 1, 1)  # (N, B, 1, H, W)
     last = frames[:, torch.arange(len(step)), step - context - 1]  # (N, B, 1, H, W)
-    log_probs: Tensor = judge(_history(last, mean))
+    log_probs: Tensor = classifier(_history(last, mean))
     return log_probs.double().exp()
 
 
 def summarise(readings: Increments, prefixes: Prefixes, length: int) -> dict[str, Tensor]:
-    """Return the scores of each digit, `(B,)`, by name and step, from what was read of its completions."""
+    """Return the scores of each digit, `(B,)`, by name and step, from the output of `score_completions`."""
     scores = summarise_classes(readings["classes"], prefixes) | {"clear[end]": readings["clear"][:, 0]}
     for share in _SHARES:
         kept, early = (readings[f"{name} {share}"][:, 0] for name in ("kept", "early"))
@@ -223,12 +228,12 @@ def summarise(readings: Increments, prefixes: Prefixes, length: int) -> dict[str
 
 
 def summarise_classes(classes: Tensor, prefixes: Prefixes) -> dict[str, Tensor]:
-    """Return the scores of a distribution of the class, `(B, 10)`, for each digit, `(B,)`."""
-    own = classes.gather(1, prefixes.labels[:, None])[:, 0]  # (B,)
+    """Return the scores of a class distribution, `(B, 10)`, for each digit, `(B,)`."""
+    of_label = classes.gather(1, prefixes.labels[:, None])[:, 0]  # (B,)
     return {
         "js[end]": jensen_shannon(classes, prefixes.reference),
         "entropy[end]": entropy(classes),
         "entropy_gap[end]": entropy(classes) - entropy(prefixes.reference),
-        "nll[end]": -own.log(),
+        "nll[end]": -of_label.log(),
         "classes[end]": (classes > _MASS).double().sum(1),
     }

@@ -1,4 +1,4 @@
-"""Training digits that begin alike: what may become of a beginning, without asking any model."""
+"""Training digits with similar beginnings: possible completions of a digit, without a model."""
 
 from collections.abc import Callable
 
@@ -8,28 +8,28 @@ from torch.nn.functional import avg_pool2d
 
 from forbes.data import SequenceDataModule, Strokes
 
-__all__ = ["Beginnings", "last_frame", "mean_frame"]
+__all__ = ["TrainingPrefixes", "last_frame", "mean_frame"]
 
 
 def last_frame(frames: Tensor) -> Tensor:
-    """Look at where the pen has been, `(B, T, C, H, W)` to `(B, C, H, W)`."""
+    """Return the last frame, which shows where the pen has been, `(B, T, C, H, W)` to `(B, C, H, W)`."""
     return frames[:, -1].float()
 
 
 def mean_frame(frames: Tensor) -> Tensor:
-    """Look at where the pen has been and in which order, since pictures are cumulative; shapes as of `last_frame`."""
+    """Return the mean frame, `(B, T, C, H, W)` to `(B, C, H, W)`. As frames are cumulative, it shows the order too."""
     return frames.sum(1).float() / frames.shape[1]
 
 
-class Beginnings:
-    """The training digits that go on after some step, by what they look like there.
+class TrainingPrefixes:
+    """TrainingPrefixes of the training digits that continue after some step.
 
-    They are compared after a blur of five pixels, so that a pen one pixel aside is near.
+    They are compared after a blur of five pixels, so that strokes one pixel apart are near.
 
     Args:
-        data: of strokes.
-        time: steps of the beginning.
-        look: makes one picture of its frames, `last_frame` or `mean_frame`.
+        data: data module of digit strokes.
+        time: number of steps of the beginning.
+        look: function that reduces the frames to one image, `last_frame` or `mean_frame`.
     """
 
     def __init__(self, data: SequenceDataModule, time: int, look: Callable[[Tensor], Tensor]) -> None:
@@ -40,7 +40,7 @@ class Beginnings:
         self.pictures = torch.cat([self._picture(data.source.pictures(frames)) for frames in parts])  # (M, H W)
 
     def nearest(self, frames: Tensor, count: int) -> Tensor:
-        """Find the training digits that begin most like these pictures, `(B, T, C, H, W)`, by index, `(B, count)`."""
+        """Return the indices, `(B, count)`, of the training digits most like the frames, `(B, T, C, H, W)`."""
         distance = torch.cdist(self._picture(frames), self.pictures)  # (B, M)
         return self.index[distance.topk(min(count, len(self.index)), largest=False).indices]
 

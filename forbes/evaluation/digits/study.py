@@ -1,48 +1,44 @@
-"""Completions of several runs on the same digits, side by side: scores, paired differences, a record and tables."""
+"""Compare completions of several runs on the same digits: scores, paired differences, record and tables."""
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 from torch import Tensor
 
 from forbes.data import Split
 from forbes.data.strokes.classifiers import DigitClassifiers, calibration_error
 from forbes.evaluation.digits.completions import (
     Prefixes,
-    model_pass,
-    neighbour_pass,
+    model_scorer,
+    neighbour_scorer,
     summarise,
     summarise_classes,
-    truth_pass,
+    truth_scorer,
 )
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import TrainedRun
 from forbes.evaluation.scoring import Scorer, score_split, with_progress
 
-__all__ = ["Row", "Study", "entries", "print_study", "study"]
+__all__ = ["Row", "Study", "entries", "study"]
 
 
 class Row(NamedTuple):
-    """What completions of one kind score; of the reference, which completes nothing, the scores of the class only."""
+    """Scores of one kind of completions. The reference completes nothing and has the scores of the class only."""
 
     name: str
     path: str | None
-    """Of the run; None where no model is asked."""
+    """Run folder; None if there is no model."""
     scores: Mapping[str, Tensor]
-    """Of each digit, `(B,)`, by score and step: `js[end]`."""
+    """Score of each digit, `(B,)`, by score and step, e.g. `js[end]`."""
     calibration: float
-    """ECE of the class, one number for all digits."""
+    """ECE of the class over all digits."""
     classes: Tensor
-    """Distribution of the class for each digit, `(B, 10)`."""
+    """Class distribution of each digit, `(B, 10)`."""
     best: Sequence[float] = ()
     """Expected error of the best of n completions, n = 1 … N, mean over digits."""
     average: Sequence[float] = ()
-    """Expected error of the average picture of n completions."""
+    """Expected error of the average image of n completions, n = 1 … N, mean over digits."""
 
 
 class Study(NamedTuple):
@@ -50,18 +46,18 @@ class Study(NamedTuple):
 
     prefixes: Prefixes
     samples: int
-    """N."""
+    """Number of completions, N."""
     reference: Row
-    """The prefix classifier."""
+    """Scores of the prefix classifier."""
     runs: list[Row]
     similar: Row
-    """The training digits that begin most alike, in place of completions."""
+    """Scores of the training digits with the most similar beginnings, as completions."""
     truth: Row
-    """The true digits, in place of completions."""
+    """Scores of the true digits, as completions."""
 
     @property
     def differences(self) -> list[tuple[Row, Row, dict[str, Estimate]]]:
-        """Return the mean difference of the first run to each other one, paired over digits."""
+        """Mean difference of the first run minus each other run, paired over digits."""
         first = self.runs[0]
         return [
             (first, other, {name: Estimate.of(values - other.scores[name]) for name, values in first.scores.items()})
@@ -70,23 +66,28 @@ class Study(NamedTuple):
 
 
 def study(
-    runs: Mapping[str, TrainedRun], judges: DigitClassifiers, prefixes: Prefixes, split: Split, samples: int, seed: int
+    runs: Mapping[str, TrainedRun],
+    classifiers: DigitClassifiers,
+    prefixes: Prefixes,
+    split: Split,
+    samples: int,
+    seed: int,
 ) -> Study:
-    """Complete the same beginnings by every run.
+    """Complete the same prefixes with every run, and score the completions.
 
     Args:
-        runs: by the name that tells them apart, on the same data.
-        judges: the classifiers of these data.
-        prefixes: the beginnings.
-        split: of the digits.
-        samples: N completions of each.
-        seed: of the noise, the same for every run.
+        runs: runs on the same data, by title.
+        classifiers: classifiers of these data.
+        prefixes: prefixes to complete.
+        split: split of the digits.
+        samples: number of completions per digit, N.
+        seed: random seed for the noise, the same for every run.
     """
     first = next(iter(runs.values()))
     data, length, context = first.data, first.data.length, prefixes.context
 
     def measure(name: str, path: str | None, run: TrainedRun, score: Scorer) -> Row:
-        where = f"{name}, {split} digits in the order of their length"
+        where = f"{name}, {split} digits sorted by length"
         batches = with_progress(prefixes.batches(data, split), f"{name}, {context} steps seen", len(prefixes.digits))
         readings = score_split(run.model, batches, score, seed, where).values
         classes, scores = readings["classes"], summarise(readings, prefixes, length)
@@ -95,23 +96,23 @@ def study(
 
     classes = prefixes.reference
     error = calibration_error(classes, prefixes.labels)
-    own = model_pass(data, context, samples, judges)
+    scorer = model_scorer(data, context, samples, classifiers)
     return Study(
         prefixes,
         samples,
         Row("reference", None, summarise_classes(classes, prefixes), error, classes),
-        [measure(name, run.path, run, own) for name, run in runs.items()],
-        measure("similar digits", None, first, neighbour_pass(data, context, samples, judges)),
-        measure("true digits", None, first, truth_pass(data, context, judges)),
+        [measure(name, run.path, run, scorer) for name, run in runs.items()],
+        measure("similar digits", None, first, neighbour_scorer(data, context, samples, classifiers)),
+        measure("true digits", None, first, truth_scorer(data, context, classifiers)),
     )
 
 
 def entries(study: Study, digits: str) -> list[dict[str, Any]]:
-    """List every score of every row by its full name, with differences; for `completions.json`.
+    """Return all scores and differences by full name, as entries for `completions.json`.
 
     Args:
-        study: of one length of the prefix.
-        digits: what the prefixes are of, e.g. `test[:300]`.
+        study: results for one length of the prefix.
+        digits: name of the digits, e.g. `test[:300]`.
     """
     context = study.prefixes.context
 
@@ -130,64 +131,5 @@ def entries(study: Study, digits: str) -> list[dict[str, Any]]:
 
 
 def _entry(estimate: Estimate) -> dict[str, float | None]:
-    """JSON has no NaN."""
+    """Return an estimate for JSON, with None for NaN."""
     return {key: value if math.isfinite(value) else None for key, value in estimate._asdict().items()}
-
-
-def print_study(study: Study, length: int) -> None:
-    """Print a table of classes and one of pixels."""
-    title = f"{len(study.prefixes.digits)} digits, {study.prefixes.context} steps seen, {study.samples} completions"
-    of_classes = {
-        "js[end]": "JS to the\nreference",
-        "entropy[end]": "entropy",
-        "entropy_gap[end]": "entropy\ngap",
-        "nll[end]": "−log p of\nthe label",
-        "ece[end]": "ECE",
-        "classes[end]": "classes\nabove 5 %",
-        "clear[end]": "clear\ndigits",
-        "kept[60%]": "class kept\nfrom 60 %",
-        "kept[80%]": "class kept\nfrom 80 %",
-    }
-    of_pixels = {
-        f"energy[t<={length}]": f"energy score\nt ≤ {length}",
-        "energy[end]": "energy score\nend",
-        f"crps[t<={length}]": f"CRPS\nt ≤ {length}",
-        "crps[end]": "CRPS\nend",
-        "grey[end]": "grey\nink",
-        "error[end]": "error\nof one",
-        "best[end]": f"error of the\nbest of {study.samples}",
-        "average[end]": f"error of the\naverage of {study.samples}",
-    }
-    console = Console(width=None if sys.stdout.isatty() else 160)  # into a file, rich would fold at 80
-    console.print(
-        _table(
-            study,
-            f"{title}: their classes, nats",
-            of_classes,
-            [*study.runs, study.reference, study.similar, study.truth],
-        )
-    )
-    console.print(_table(study, f"{title}: their pixels", of_pixels, [*study.runs, study.similar, study.truth]))
-
-
-def _table(study: Study, title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> Table:
-    table = Table(title=title)
-    table.add_column("", overflow="fold")
-    for header in columns.values():
-        table.add_column(header, justify="right")
-    for row in rows:
-        values = {score: _cell(Estimate.of(each)) for score, each in row.scores.items()}
-        values["ece[end]"] = f"{row.calibration:.3f}"
-        table.add_row(escape(row.name), *(values.get(score, "") for score in columns))
-    table.add_section()
-    for one, other, scores in study.differences:
-        values = {score: _cell(each, sign="+") for score, each in scores.items()}
-        table.add_row(escape(f"{one.name} − {other.name}"), *(values.get(score, "") for score in columns))
-    return table
-
-
-def _cell(estimate: Estimate, sign: str = "") -> str:
-    """Write a mean above its standard error."""
-    if not math.isfinite(estimate.mean):
-        return "n/a"
-    return f"{estimate.mean:{sign}.3f}\n± {estimate.standard_error:.3f}"

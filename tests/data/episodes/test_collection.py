@@ -60,16 +60,16 @@ def test_a_broken_episode_is_played_again_and_leaves_no_trace(tmp_path, capsys):
         for mine, other in zip(ours.episode(number), theirs.episode(number), strict=True):
             np.testing.assert_array_equal(mine, other)
         assert ours.records[number].seed == theirs.records[number].seed
-    assert capsys.readouterr().err.count("episode 0 is dropped and played again") == 2
+    assert capsys.readouterr().err.count("episode 0 is dropped and replayed") == 2
 
 
-def test_what_breaks_three_times_ends_the_collection_and_loses_nothing(tmp_path):
+def test_three_failures_end_the_collection_and_lose_nothing(tmp_path):
     store = tmp_path / "store"
     collect(store, Echo(), 2)
     make = partial(Troubled, "rewards_nan", tmp_path / "ledger", times=3)
     with (
         EnvironmentProcess(make) as environment,
-        pytest.raises(ForbesError, match=r"the reward is nan.*; so broke episode 2 3 times.*Mend the environment$"),
+        pytest.raises(ForbesError, match=r"the reward is nan.*; episode 2 failed 3 times.*Fix the environment$"),
     ):
         collect(store, environment, 4)
 

@@ -99,7 +99,7 @@ def at_each_sync(store, monkeypatch, act):
     monkeypatch.undo()
 
 
-def test_a_reader_sees_the_same_before_during_and_after_a_compaction(store, monkeypatch):
+def test_a_reader_sees_the_same_throughout_a_compaction(store, monkeypatch):
     before, seen = Said.by(store), []
     at_each_sync(store, monkeypatch, lambda: seen.append(Said.by(store)))
 
@@ -129,7 +129,7 @@ def test_a_kill_while_the_index_is_compacted_loses_nothing(store, monkeypatch, w
 
 
 @pytest.mark.parametrize("line", range(5))
-def test_a_line_that_is_repeated_at_the_end_overwrites_no_episode(store, line):
+def test_a_line_repeated_at_the_end_overwrites_no_episode(store, line):
     index, before = store / "index.jsonl", Said.by(store)
     lines = index.read_text().splitlines()
     assert len(lines) == 5
@@ -141,7 +141,7 @@ def test_a_line_that_is_repeated_at_the_end_overwrites_no_episode(store, line):
     assert whole(store) == [1, 2, 3, 4]
 
 
-def test_a_line_repeated_after_going_back_to_a_checkpoint_overwrites_no_episode(store):
+def test_a_line_repeated_after_resuming_overwrites_no_episode(store):
     index = store / "index.jsonl"
     with EpisodeWriter(store) as writer:
         writer.set_aside(2)
@@ -164,7 +164,7 @@ LOST = {
 
 
 @pytest.mark.parametrize("how", LOST)
-def test_a_lost_index_is_rebuilt_from_the_episodes_and_this_is_said(tmp_path, how, capsys):
+def test_a_lost_index_is_rebuilt_from_episodes_with_a_warning(tmp_path, how, capsys):
     with EpisodeWriter(tmp_path) as writer:
         records = {number: append(writer) for number in range(4)}
     LOST[how](tmp_path / "index.jsonl")
@@ -181,7 +181,7 @@ def test_a_lost_index_is_rebuilt_from_the_episodes_and_this_is_said(tmp_path, ho
         assert not capsys.readouterr().err
 
 
-def test_what_a_lost_index_cannot_be_rebuilt_from_is_set_aside_and_counted(store, capsys):
+def test_what_cannot_restore_a_lost_index_is_moved_and_counted(store, capsys):
     (store / "000002.npz").write_bytes(b"damaged")
     (store / "000001.npz").rename(store / "000007.npz")
     (store / "index.jsonl").unlink()
@@ -253,7 +253,7 @@ def test_a_line_of_another_environment_is_one_sentence(store):
     lines[3] = lines[3].replace('"action_dim": 1', '"action_dim": 2')
     index.write_text("\n".join(lines) + "\n")
 
-    with pytest.raises(ForbesError, match=r"line 4 is not .*\(its action_dim is not that of the episodes before\)"):
+    with pytest.raises(ForbesError, match=r"line 4 is not .*\(its action_dim is not that of the previous episodes\)"):
         EpisodeStore(store)
 
 

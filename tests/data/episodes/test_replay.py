@@ -96,7 +96,7 @@ def test_an_episode_shorter_than_a_window_is_padded(path):
         assert not values[~batch.mask].any()
 
 
-def test_the_observation_is_what_the_action_of_the_same_index_led_to(tmp_path):
+def test_observations_follow_from_the_action_of_their_index(tmp_path):
     """In this environment the next observation and the reward are the action: one step aside, and nothing agrees."""
     with EpisodeWriter(tmp_path / "echo") as writer:
         for seed in range(4):
@@ -115,7 +115,7 @@ def test_the_observation_is_what_the_action_of_the_same_index_led_to(tmp_path):
     assert seen[later].abs().min() > 0
 
 
-def test_a_batch_depends_on_the_seed_the_update_and_the_episodes_held_only(path):
+def test_a_batch_depends_on_seed_update_and_held_episodes_only(path):
     source = Replay(str(path), hold_out=0)
     before = source.train_index(50, 4, 3, 17)
 
@@ -155,7 +155,7 @@ def test_a_capacity_holds_the_latest_episodes(path):
     assert drawn(source, 20, 50, 4).observation[..., 0].unique().tolist() == [1, 2]
 
 
-def test_one_episode_in_ten_is_of_each_held_out_split_whatever_comes_later(tmp_path):
+def test_each_held_out_split_keeps_its_tenth_of_the_episodes(tmp_path):
     path = str(tmp_path / "store")
     add(path, [6] * 12)
     source = Replay(path)
@@ -184,7 +184,7 @@ def test_held_out_windows_tile_their_episodes(tmp_path):
     assert sum(len(batch.mask) for batch in batches) == data.source.size("test")
 
 
-def test_every_index_of_the_training_split_is_a_window_of_its_own(path):
+def test_each_index_of_the_training_split_is_its_own_window(path):
     source = Replay(str(path), hold_out=0)
 
     batch = source.decode(source.gather("train", torch.arange(source.size("train")), 2))
@@ -263,7 +263,7 @@ def test_an_empty_store_and_an_empty_split_are_one_sentence(tmp_path, path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ForbesError, match=r"empty: there are no episodes\. Collect some: forbes data collect --task"):
         Replay(str(tmp_path / "empty"))
-    with pytest.raises(ForbesError, match=r"no episode is of the split test, expected one of 10\. Collect more"):
+    with pytest.raises(ForbesError, match=r"the test split has no episodes, expected one out of 10\. Collect more"):
         next(iter(SequenceDataModule(Replay(str(path))).test_dataloader()))
 
 

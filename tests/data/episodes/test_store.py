@@ -79,7 +79,7 @@ def test_the_same_episodes_are_the_same_bytes(store, tmp_path):
         assert (tmp_path / "again" / name).read_bytes() == (store / name).read_bytes()
 
 
-def test_a_reader_sees_what_another_process_adds_when_it_looks_again(store):
+def test_a_reader_sees_added_episodes_after_a_refresh(store):
     reader = EpisodeStore(store)
     with EpisodeWriter(store) as writer:
         append(writer)
@@ -170,7 +170,7 @@ def test_a_full_disk_leaves_the_store_as_it_was(store, when, name, monkeypatch):
     with EpisodeWriter(store) as writer:
         with monkeypatch.context() as patch:
             patch.setattr(os, "fsync", fsync)
-            with pytest.raises(ForbesError, match=rf"{name}: cannot be written \(No space left .*\)\. Make room"):
+            with pytest.raises(ForbesError, match=rf"{name}: cannot be written \(No space left .*\)\. Free some space"):
                 append(writer)
         assert (store / "index.jsonl").read_bytes() == index
         assert sorted(path.name for path in store.glob("*.npz")) == ["000000.npz", "000001.npz", "000002.npz"]
@@ -260,7 +260,7 @@ def test_a_damaged_file_is_named_and_quarantined(store, damage):
     path.write_bytes(DAMAGE[damage](path.read_bytes()))
 
     with pytest.raises(
-        DamagedEpisodeError, match=r"000001\.npz: damaged \(.*\)\. Put it aside with: forbes data check"
+        DamagedEpisodeError, match=r"000001\.npz: damaged \(.*\)\. Move it to quarantine with: forbes data check"
     ):
         EpisodeStore(store).episode(1)
     with EpisodeWriter(store) as writer:
@@ -286,7 +286,7 @@ def test_objects_are_never_unpickled(store):
     record = EpisodeStore(store).records[0]._replace(size=len(content))
     from forbes.data.episodes.episode import map_episode
 
-    with pytest.raises(DamagedEpisodeError, match="holds objects"):
+    with pytest.raises(DamagedEpisodeError, match="has dtype object"):
         map_episode(store / "evil.npz", record, verify=False)
 
 
@@ -329,10 +329,10 @@ def test_an_episode_that_is_not_whole_is_not_stored(store, sentence):
     assert numbers(store) == [0, 1, 2]
 
 
-def test_episodes_of_another_environment_are_refused_but_another_machine_is_welcome(store):
+def test_other_environments_are_refused_but_not_other_machines(store):
     with EpisodeWriter(store) as writer:
         with pytest.raises(
-            ForbesError, match=r"holds episodes whose task is Counting, not Other\. Choose another folder"
+            ForbesError, match=r"has episodes whose task is Counting, not Other\. Choose another folder"
         ):
             append(writer, environment=ENVIRONMENT | {"task": "Other"})
         append(writer, environment=ENVIRONMENT | {"made_by": {"machine": "that"}})
@@ -340,15 +340,15 @@ def test_episodes_of_another_environment_are_refused_but_another_machine_is_welc
 
 
 @pytest.mark.parametrize("missing", ["task", "observation_shape", "action_dim", "discrete"])
-def test_an_environment_that_says_too_little_is_refused_when_it_is_given(missing, store):
+def test_an_environment_that_describes_too_little_is_refused(missing, store):
     about = {name: value for name, value in ENVIRONMENT.items() if name != missing}
-    sentence = f"its environment has no {missing}, expected what `describe_environment` gives"
+    sentence = f"its environment has no {missing}, expected the result of `describe_environment`"
     with EpisodeWriter(store) as writer, pytest.raises(ForbesError, match=sentence):
         append(writer, environment=about)
     assert numbers(store) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("name", "value"), [("observation_shape", [3]), ("action_dim", 2)])
-def test_an_environment_of_other_shapes_than_its_episode_is_refused(name, value, tmp_path):
+def test_shapes_unlike_those_of_the_episode_are_refused(name, value, tmp_path):
     with EpisodeWriter(tmp_path) as writer, pytest.raises(ForbesError, match=f"its environment's {name} is"):
         append(writer, environment=ENVIRONMENT | {name: value})

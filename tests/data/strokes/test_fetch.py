@@ -118,7 +118,7 @@ def test_a_download_gives_the_servers_bytes(server, tmp_path):
 
 def test_an_interrupted_download_goes_on_where_it_stopped(server, tmp_path):
     server.hang_up_after = 70_000
-    with pytest.raises(ForbesError, match=r"interrupted after 70000 of 200000 bytes\. Run it again to go on"):
+    with pytest.raises(ForbesError, match=r"interrupted after 70000 of 200000 bytes\. Run it again to resume"):
         download(server.url, tmp_path / "file", "Do this.")
     server.hang_up_after = None
     download(server.url, tmp_path / "file", "Do this.")
@@ -161,7 +161,7 @@ def test_without_a_network_one_sentence_names_the_ways_out(tmp_path, monkeypatch
     monkeypatch.setattr(fetch, "DEJONG_URL", "http://127.0.0.1:1/sequences.tar.gz")
 
     with pytest.raises(
-        ForbesError, match=r"could not be downloaded .* --from PATH, or use the origin bundled"
+        ForbesError, match=r"could not be downloaded .* --from PATH, or use the bundled origin"
     ) as error:
         fetch_dejong(None, tmp_path / "dejong-strokes.npz")
 
@@ -176,7 +176,7 @@ def test_the_blob_id_is_gits(tmp_path):
     assert git_blob_id(tmp_path / "file") == said.strip()
 
 
-def test_the_archive_and_its_extracted_folder_give_the_same_digits(tarball, folder):
+def test_an_archive_and_its_folder_give_the_same_digits(tarball, folder):
     wanted = wanted_files(DIGITS)
 
     splits = convert(read_archive(tarball, wanted), DIGITS, tarball)
@@ -229,20 +229,20 @@ def test_a_converted_file_of_other_digits_is_refused(few_digits, tmp_path):
 
 
 def test_a_path_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ForbesError, match="absent: there is no such file or folder"):
+    with pytest.raises(ForbesError, match="absent: no such file or folder"):
         fetch_dejong(tmp_path / "absent", tmp_path / "dejong-strokes.npz")
 
 
 HOSTILE = [
-    ([entry("../trainlabels.txt", b"1\n")], r"\.\./trainlabels\.txt is a link or leads outside"),
-    ([entry("sequences/../../trainlabels.txt", b"1\n")], "is a link or leads outside"),
-    ([entry("/sequences/trainlabels.txt", b"1\n")], "is a link or leads outside"),
-    ([entry("sequences/trainlabels.txt", kind=tarfile.SYMTYPE, linkname="/etc/passwd")], "is a link or leads outside"),
-    ([entry("sequences/other", kind=tarfile.LNKTYPE, linkname="/etc/passwd")], "is a link or leads outside"),
-    ([entry("sequences/other", kind=tarfile.FIFOTYPE)], "is a link or leads outside"),
-    ([entry("sequences/other", kind=tarfile.CHRTYPE)], "is a link or leads outside"),
-    ([entry("sequences/testlabels.txt", b"7\n")], "testlabels.txt is there twice"),
-    ([entry("./sequences//testlabels.txt", b"7\n")], "testlabels.txt is there twice"),
+    ([entry("../trainlabels.txt", b"1\n")], r"\.\./trainlabels\.txt is a link or points outside"),
+    ([entry("sequences/../../trainlabels.txt", b"1\n")], "is a link or points outside"),
+    ([entry("/sequences/trainlabels.txt", b"1\n")], "is a link or points outside"),
+    ([entry("sequences/trainlabels.txt", kind=tarfile.SYMTYPE, linkname="/etc/passwd")], "is a link or points outside"),
+    ([entry("sequences/other", kind=tarfile.LNKTYPE, linkname="/etc/passwd")], "is a link or points outside"),
+    ([entry("sequences/other", kind=tarfile.FIFOTYPE)], "is a link or points outside"),
+    ([entry("sequences/other", kind=tarfile.CHRTYPE)], "is a link or points outside"),
+    ([entry("sequences/testlabels.txt", b"7\n")], "testlabels.txt occurs twice"),
+    ([entry("./sequences//testlabels.txt", b"7\n")], "testlabels.txt occurs twice"),
 ]
 
 
@@ -306,7 +306,7 @@ def test_missing_files_are_named(tmp_path, folder, name):
     ("labels", "message"),
     [
         (b"4\n", "expected one more than the 1 labels"),
-        (b"4\nx\n", "a label is no number"),
+        (b"4\nx\n", "a label is not a number"),
         (b"4\n12\n", "a label is 12"),
     ],
 )
@@ -348,5 +348,5 @@ def test_other_curves_are_refused_and_those_that_were_there_stay(local, few_curv
 
 
 def test_a_copy_of_the_curves_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ForbesError, match=r"absent\.json: there is no such file\. Give a local copy with"):
+    with pytest.raises(ForbesError, match=r"absent\.json: no such file\. Give a local copy with"):
         fetch_curves(tmp_path / "absent.json", tmp_path / "curves.json")

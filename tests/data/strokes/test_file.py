@@ -58,7 +58,7 @@ def test_saving_leaves_nothing_else_behind(splits, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["strokes.npz"]
 
 
-def test_the_bundled_set_is_small_and_the_one_its_readme_describes():
+def test_the_bundled_set_is_small_and_matches_its_readme():
     content = bundled_path().read_bytes()
 
     assert len(content) <= 3_000_000
@@ -66,7 +66,7 @@ def test_the_bundled_set_is_small_and_the_one_its_readme_describes():
 
 
 def test_a_missing_file_is_named_with_the_remedy(tmp_path):
-    with pytest.raises(ForbesError, match=r"absent\.npz: there is no such file\. Do this\."):
+    with pytest.raises(ForbesError, match=r"absent\.npz: no such file\. Do this\."):
         load_strokes(tmp_path / "absent.npz", "Do this.")
 
 
@@ -119,7 +119,7 @@ def write(path, splits, **changed):
         ({"train_offsets": np.array([1, 3, 5], np.int32)}, "offsets run from 1 to 5"),
         ({"train_offsets": np.array([0, 5], np.int32)}, "offsets has 2 entries, expected one more than the 2 labels"),
         ({"train_offsets": np.array([], np.int32)}, "offsets has 0 entries"),
-        ({"train_pen_up": np.ones(4, bool)}, "pen_up has 4 entries, expected one for each of 5 points"),
+        ({"train_pen_up": np.ones(4, bool)}, "pen_up has 4 entries, expected one per point, 5"),
         ({"train_pen_up": np.zeros(5, bool)}, "a digit ends with the pen down"),
         ({"test_labels": np.array([10], np.uint8)}, "a label is 10, expected 0 to 9"),
     ],
@@ -146,5 +146,5 @@ def test_a_file_that_loading_would_refuse_is_not_written(splits, tmp_path):
 def test_a_place_that_cannot_be_written_is_named(splits, tmp_path):
     (tmp_path / "file").touch()
 
-    with pytest.raises(ForbesError, match=r"strokes\.npz: cannot be written \(.*\)\. Choose another place"):
+    with pytest.raises(ForbesError, match=r"strokes\.npz: cannot be written \(.*\)\. Choose another folder"):
         save_strokes(tmp_path / "file" / "strokes.npz", splits)

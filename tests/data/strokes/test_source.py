@@ -48,7 +48,7 @@ def test_frames_are_what_a_slow_reference_renders(source, length, points_per_ste
         np.testing.assert_array_equal(frames, render_slowly(path, length, points_per_step))
 
 
-def test_frames_of_the_bundled_digits_are_what_a_slow_reference_renders():
+def test_bundled_digit_frames_match_a_slow_reference():
     strokes = Strokes(frames="whole")
     arrays = strokes.arrays("validation")
     index = torch.arange(0, 5000, 500)
@@ -85,7 +85,7 @@ def test_a_step_of_one_point_writes_at_most_one_pixel():
     assert not pixels[written.mask].all()  # where the pen crosses its own path it adds nothing
 
 
-def test_a_picture_of_probabilities_is_that_of_independent_pixels():
+def test_pictures_of_probabilities_have_independent_pixels():
     chance = torch.rand(2, 3, 1, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     pictures = Strokes(frames="written").pictures(chance)
@@ -163,14 +163,14 @@ def test_the_last_training_digits_are_the_validation_split():
 def test_the_file_is_read_on_first_use_only(tmp_path):
     strokes = Strokes(path=str(tmp_path / "absent.npz"))
 
-    with pytest.raises(ForbesError, match=r"absent\.npz: there is no such file\. Rebuild it with: forbes data build"):
+    with pytest.raises(ForbesError, match=r"absent\.npz: no such file\. Rebuild it with: forbes data build"):
         strokes.size("train")
 
 
 def test_the_papers_set_is_looked_for_where_forbes_data_points(tmp_path, monkeypatch):
     monkeypatch.setenv("FORBES_DATA", str(tmp_path))
 
-    with pytest.raises(ForbesError, match="forbes data fetch strokes --from PATH, or use the origin bundled") as error:
+    with pytest.raises(ForbesError, match="forbes data fetch strokes --from PATH, or use the bundled origin") as error:
         Strokes("dejong").size("train")
 
     assert str(tmp_path / "dejong-strokes.npz") in str(error.value)

@@ -8,10 +8,10 @@ import torch
 from forbes.errors import ForbesError
 from forbes.evaluation.calibration.ranks import coverage, ranks, tarp_ranks, two_sample_test
 from forbes.evaluation.calibration.uniformity import kolmogorov_smirnov, pearson, spread
-from forbes.evaluation.theorem import LinearGaussian, exact_filter, factorised_optimum, structured_optimum
+from forbes.evaluation.theorem import ClosedFormProcess, exact_filter, factorised_optimum, structured_optimum
 
 LEVEL, SAMPLES = 0.05, 50
-PROCESS = LinearGaussian(1.0, 1.0, 1.0, steps=15)
+PROCESS = ClosedFormProcess(1.0, 1.0, 1.0, steps=15)
 MIDDLE = 7
 
 
@@ -86,7 +86,7 @@ def test_coverage_is_the_closed_form(posterior_of, covered):
     assert shares.tolist()[::2] == [0, 1]
 
 
-def test_coverage_of_evenly_spread_ranks_is_the_level_at_every_level():
+def test_evenly_spread_ranks_cover_each_level_exactly():
     levels = torch.linspace(0, 1, 33, dtype=torch.float64)
 
     torch.testing.assert_close(coverage(torch.arange(11), 10, levels), levels)
@@ -123,7 +123,7 @@ def test_a_truth_without_density_has_the_lowest_rank():
     assert ranks(density, torch.zeros(5, 1), generator()).tolist() == [0]
 
 
-def test_tarp_ranks_are_those_of_the_distance_from_the_sample_left_out_before():
+def test_tarp_ranks_use_distances_from_a_left_out_sample():
     samples = torch.tensor([[[0.0, 0.0], [4.0, 2.0]], [[1.0, 0.0], [0.0, 1.0]], [[5.0, 2.0], [3.0, 0.0]]]).double()
     truth = torch.tensor([[4.0, 1.0], [0.0, 0.5]]).double()
 
@@ -140,7 +140,7 @@ def test_tarp_does_not_depend_on_units():
     assert torch.equal(tarp_ranks(truth * unit, samples * unit, generator()), plain)
 
 
-def test_tarp_sees_a_correlation_that_the_ranks_of_each_dimension_cannot():
+def test_tarp_sees_a_correlation_that_marginal_ranks_miss():
     mixing = torch.linalg.cholesky(torch.tensor([[1.0, 0.8], [0.8, 1.0]]).double()).T
     truth, samples = normal(1000, 2) @ mixing, normal(SAMPLES + 1, 1000, 2, seed=1)
 
@@ -167,7 +167,7 @@ def two_sample_tests(count, width, repeats, permutations=99):
     return torch.tensor([test.p_value for test in tests]), torch.tensor([test.accuracy for test in tests])
 
 
-def test_true_values_of_exact_beliefs_are_told_apart_at_the_level():
+def test_exact_beliefs_are_rejected_as_often_as_the_level_says():
     repeats = 400
 
     p_value, accuracy = two_sample_tests(count=100, width=1.0, repeats=repeats)
@@ -199,7 +199,7 @@ def test_two_values_of_one_pair_never_judge_each_other():
     assert p_value > 0.01
 
 
-def test_accuracy_of_two_gaussians_is_nearly_that_of_the_best_classifier():
+def test_accuracy_on_two_gaussians_is_close_to_the_best():
     samples = torch.cat((normal(1, 1000, 1, seed=1) + 2, torch.zeros(1, 1000, 1)))  # nothing is known beside the values
 
     accuracy, p_value = two_sample_test(normal(1000, 1), samples, generator(), permutations=99)
@@ -209,7 +209,7 @@ def test_accuracy_of_two_gaussians_is_nearly_that_of_the_best_classifier():
     assert p_value == 0.01
 
 
-def test_a_missing_mode_is_told_apart_and_a_constant_dimension_does_no_harm():
+def test_a_missing_mode_is_seen_despite_a_constant_dimension():
     sign = torch.where(normal(400, 1) > 0, 1.0, -1.0)
     truth = torch.cat((3 * sign + normal(400, 1, seed=1), torch.ones(400, 1)), 1)
     sample = torch.cat((3 + normal(400, 1, seed=2), torch.ones(400, 1)), 1)
@@ -223,13 +223,19 @@ def test_a_missing_mode_is_told_apart_and_a_constant_dimension_does_no_harm():
 @pytest.mark.parametrize(
     ("call", "expected"),
     [
-        (lambda g: ranks(normal(3, 2), normal(9, 2, 3), g), r"^ranks: \(9, 2, 3\) samples for \(3, 2\) true values"),
+        (
+            lambda g: ranks(normal(3, 2), normal(9, 2, 3), g),
+            r"^ranks: samples have shape \(9, 2, 3\) and true values \(3, 2\)",
+        ),
         (lambda g: ranks(normal(3).log(), normal(9, 3), g), r"^ranks: there are NaN"),
-        (lambda g: tarp_ranks(normal(3, 2), normal(9, 3, 1), g), r"^tarp_ranks: \(9, 3, 1\) samples for \(3, 2\)"),
+        (lambda g: tarp_ranks(normal(3, 2), normal(9, 3, 1), g), r"^tarp_ranks: samples have shape \(9, 3, 1\)"),
         (lambda g: tarp_ranks(normal(3, 2), normal(1, 3, 2), g), "^tarp_ranks: 3 pairs with 1 samples"),
         (lambda g: tarp_ranks(normal(1, 2), normal(9, 1, 2), g), "^tarp_ranks: 1 pairs with 9 samples"),
         (lambda g: tarp_ranks(normal(3, 2) / 0, normal(9, 3, 2), g), "^tarp_ranks: there are infinite values"),
-        (lambda g: two_sample_test(normal(30, 2), normal(9, 30, 3), g), r"^two_sample_test: \(9, 30, 3\) samples for"),
+        (
+            lambda g: two_sample_test(normal(30, 2), normal(9, 30, 3), g),
+            r"^two_sample_test: samples have shape \(9, 30",
+        ),
         (lambda g: two_sample_test(normal(9, 2), normal(9, 9, 2), g), "^two_sample_test: 9 pairs with 9 samples"),
         (lambda g: two_sample_test(normal(30, 2), normal(1, 30, 2), g), "^two_sample_test: 30 pairs with 1 samples"),
         (lambda g: two_sample_test(normal(30, 2), normal(9, 30, 2).log(), g), "^two_sample_test: there are NaN"),

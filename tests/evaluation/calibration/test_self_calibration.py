@@ -28,7 +28,7 @@ def test_an_exact_filter_is_calibrated(seed):
     assert found.classifier.p_value > 1 / 200  # the smallest that 199 permutations can give
 
 
-def test_a_filter_that_is_too_narrow_is_caught_and_covers_too_little():
+def test_a_too_narrow_filter_is_caught_and_covers_too_little():
     model, _ = gaussian()
     with torch.no_grad():
         model.posterior.parameters_of.bias[2:] -= 0.7  # of softplus(·): about half the spread

@@ -10,14 +10,14 @@ from forbes.data.strokes.classifiers import load_classifiers
 from forbes.data.strokes.file import StrokeArrays, save_strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.digits.completions import (
-    model_pass,
-    neighbour_pass,
-    prefixes,
+    model_scorer,
+    neighbour_scorer,
     score_completions,
+    select_prefixes,
     summarise,
-    truth_pass,
+    truth_scorer,
 )
-from forbes.evaluation.digits.neighbours import Beginnings, last_frame, mean_frame
+from forbes.evaluation.digits.neighbours import TrainingPrefixes, last_frame, mean_frame
 from forbes.evaluation.scoring import score_split
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ModelParts, StateSpaceModel
 
@@ -25,7 +25,7 @@ CONTEXT, LENGTH = 5, 30
 
 
 @pytest.fixture(scope="module")
-def judges():
+def classifiers():
     return load_classifiers("bundled")
 
 
@@ -35,14 +35,14 @@ def data():
 
 
 @pytest.fixture(scope="module")
-def beginnings(data, judges):
-    return prefixes(data, "test", 20, CONTEXT, judges.prefix)
+def prefixes(data, classifiers):
+    return select_prefixes(data, "test", 20, CONTEXT, classifiers.prefix)
 
 
 @pytest.fixture(scope="module")
-def batch(data, beginnings):
+def batch(data, prefixes):
     """Twenty test digits up to the end of the longest."""
-    return data.sequences("test", beginnings.digits, int(beginnings.steps.max()))
+    return data.sequences("test", prefixes.digits, int(prefixes.steps.max()))
 
 
 @pytest.fixture
@@ -68,11 +68,11 @@ def repeated(batch, count):
     return batch.observation[:, CONTEXT:].float().expand(count, -1, -1, -1, -1, -1)
 
 
-def test_the_prefixes_are_the_digits_that_go_on_in_the_order_of_their_length(data, judges):
+def test_prefixes_are_of_digits_that_continue_sorted_by_length(data, classifiers):
     points = data.source.steps("test")[:20]
     context = int(points.sort().values[3])
 
-    found = prefixes(data, "test", 20, context, judges.prefix)
+    found = select_prefixes(data, "test", 20, context, classifiers.prefix)
 
     assert sorted(found.digits.tolist()) == [k for k in range(20) if points[k] > context]
     assert found.steps.tolist() == sorted(points[points > context].tolist())
@@ -82,17 +82,17 @@ def test_the_prefixes_are_the_digits_that_go_on_in_the_order_of_their_length(dat
     )
 
 
-def test_too_few_digits_that_go_on_are_an_error(data, judges):
+def test_too_few_digits_that_continue_are_an_error(data, classifiers):
     longest = int(data.source.steps("test")[:20].max())
-    with pytest.raises(ForbesError, match=rf"--prefixes {longest}: of 20 digits 0 go on after {longest} steps"):
-        prefixes(data, "test", 20, longest, judges.prefix)
+    with pytest.raises(ForbesError, match=rf"--prefixes {longest}: of 20 digits 0 continue after {longest} steps"):
+        select_prefixes(data, "test", 20, longest, classifiers.prefix)
 
 
-def test_a_model_that_completes_with_the_truth_scores_as_the_truth(model, data, beginnings, batch, judges):
-    readings = score_completions(repeated(batch, 3), batch, CONTEXT, LENGTH, judges)
-    truth = score_split(model, beginnings.batches(data, "test"), truth_pass(data, CONTEXT, judges)).values
+def test_completing_with_the_truth_scores_as_the_truth(model, data, prefixes, batch, classifiers):
+    readings = score_completions(repeated(batch, 3), batch, CONTEXT, LENGTH, classifiers)
+    truth = score_split(model, prefixes.batches(data, "test"), truth_scorer(data, CONTEXT, classifiers)).values
 
-    scores, expected = (summarise(each, beginnings, LENGTH) for each in (readings, truth))
+    scores, expected = (summarise(each, prefixes, LENGTH) for each in (readings, truth))
 
     for name, values in expected.items():
         torch.testing.assert_close(scores[name], values, atol=1e-6, rtol=1e-5, msg=name)  # float32 in the classifiers
@@ -102,39 +102,39 @@ def test_a_model_that_completes_with_the_truth_scores_as_the_truth(model, data, 
     assert scores["classes[end]"].median() == 1
 
 
-def test_one_drawing_for_all_has_no_diversity_and_misses_the_label(batch, beginnings, judges):
-    clear = score_completions(repeated(batch, 2), batch, CONTEXT, LENGTH, judges)["classes"].amax(1).argmax()
+def test_one_drawing_for_all_is_not_diverse_and_misses_labels(batch, prefixes, classifiers):
+    clear = score_completions(repeated(batch, 2), batch, CONTEXT, LENGTH, classifiers)["classes"].amax(1).argmax()
     end = int(batch.mask[clear].sum()) - 1
     drawing = batch.observation[clear, end].float().expand(2, len(batch.mask), batch.mask.shape[1] - CONTEXT, 1, -1, -1)
 
-    scores = summarise(score_completions(drawing, batch, CONTEXT, LENGTH, judges), beginnings, LENGTH)
+    scores = summarise(score_completions(drawing, batch, CONTEXT, LENGTH, classifiers), prefixes, LENGTH)
 
     assert scores["entropy[end]"].max() < 0.05
     assert (scores["classes[end]"] == 1).all()
-    other = beginnings.labels != beginnings.labels[clear]
+    other = prefixes.labels != prefixes.labels[clear]
     assert (scores["nll[end]"][other] > 3).all()
     torch.testing.assert_close(scores["best[end]"], scores["error[end]"])
     torch.testing.assert_close(scores["average[end]"], scores["error[end]"])
 
 
-def test_a_blur_of_all_digits_is_grey_and_not_clear(batch, judges):
+def test_a_blur_of_all_digits_is_grey_and_not_clear(batch, classifiers):
     blur = repeated(batch, 2).mean(1, keepdim=True).expand(-1, len(batch.mask), -1, -1, -1, -1)
 
-    readings = score_completions(blur, batch, CONTEXT, LENGTH, judges)
+    readings = score_completions(blur, batch, CONTEXT, LENGTH, classifiers)
 
     assert readings["clear"].max() == 0
     assert readings["grey"].min() > 0.7
 
 
-def test_a_completion_that_turns_into_another_digit_has_not_kept_its_class(batch, beginnings, judges):
+def test_turning_into_another_digit_does_not_keep_the_class(batch, prefixes, classifiers):
     frames = repeated(batch, 2)
-    kept = score_completions(frames, batch, CONTEXT, LENGTH, judges)
+    kept = score_completions(frames, batch, CONTEXT, LENGTH, classifiers)
     place, end = torch.arange(len(batch.mask)), batch.mask.sum(1) - 1
-    other = torch.stack([(beginnings.labels != label).nonzero()[0, 0] for label in beginnings.labels])
+    other = torch.stack([(prefixes.labels != label).nonzero()[0, 0] for label in prefixes.labels])
     turned = frames.clone()
     turned[:, place, end - CONTEXT] = batch.observation[other, end[other]].float()
 
-    changed = score_completions(turned, batch, CONTEXT, LENGTH, judges)
+    changed = score_completions(turned, batch, CONTEXT, LENGTH, classifiers)
 
     for share in (60, 80):
         torch.testing.assert_close(changed[f"early {share}"], kept[f"early {share}"])
@@ -144,13 +144,13 @@ def test_a_completion_that_turns_into_another_digit_has_not_kept_its_class(batch
         assert changed[f"kept {share}"].sum() <= 0.1 * early
 
 
-def test_nothing_after_the_end_of_a_digit_is_read(batch, judges):
+def test_nothing_after_the_end_of_a_digit_is_read(batch, classifiers):
     frames = repeated(batch, 2)
     beyond = ~batch.mask[:, CONTEXT:, None, None, None]
 
     def seeded(completions):
         torch.manual_seed(0)
-        return score_completions(completions, batch, CONTEXT, LENGTH, judges)
+        return score_completions(completions, batch, CONTEXT, LENGTH, classifiers)
 
     expected, found = seeded(frames), seeded(torch.where(beyond, 0.5, frames))
 
@@ -158,11 +158,11 @@ def test_nothing_after_the_end_of_a_digit_is_read(batch, judges):
         assert torch.equal(found[name], values), name
 
 
-def test_pixels_are_scored_at_the_last_step_of_the_training_too(batch, judges):
+def test_pixels_are_scored_at_the_last_step_of_the_training_too(batch, classifiers):
     wrong = repeated(batch, 2).clone()
     wrong[:, :, LENGTH - CONTEXT - 1, 0, 0, 0] = 1  # one pixel too many, at step 30
 
-    readings = score_completions(wrong, batch, CONTEXT, LENGTH, judges)
+    readings = score_completions(wrong, batch, CONTEXT, LENGTH, classifiers)
 
     reached = (batch.mask.sum(1) >= LENGTH).double()
     assert 0 < reached.mean() < 1
@@ -172,11 +172,11 @@ def test_pixels_are_scored_at_the_last_step_of_the_training_too(batch, judges):
     torch.testing.assert_close(readings["energy end"][:, 0], ends_there)
 
 
-def test_a_models_completions_are_a_function_of_the_seed(model, data, judges):
-    few = prefixes(data, "test", 3, CONTEXT, judges.prefix)
+def test_a_models_completions_are_a_function_of_the_seed(model, data, classifiers):
+    few = select_prefixes(data, "test", 3, CONTEXT, classifiers.prefix)
 
     def read(seed):
-        return score_split(model, few.batches(data, "test"), model_pass(data, CONTEXT, 3, judges), seed).values
+        return score_split(model, few.batches(data, "test"), model_scorer(data, CONTEXT, 3, classifiers), seed).values
 
     one, same, other = read(0), read(0), read(1)
 
@@ -193,7 +193,7 @@ def arrays_of(digits):
     return StrokeArrays(points, pen_up, offsets, np.arange(len(digits), dtype=np.uint8))
 
 
-def test_only_the_mean_of_its_frames_tells_in_which_order_a_beginning_was_written(tmp_path):
+def test_only_the_mean_frame_tells_the_order_of_writing(tmp_path):
     """Two training digits with the same first four pixels, written to the right and to the left, then three more."""
     right = [[x, 5] for x in (3, 8, 13, 18)]
     paths = [right + [[18, y] for y in (10, 15, 20)], right[::-1] + [[3, y] for y in (10, 15, 20)]]
@@ -202,29 +202,30 @@ def test_only_the_mean_of_its_frames_tells_in_which_order_a_beginning_was_writte
     data = SequenceDataModule(Strokes(path=str(tmp_path / "strokes.npz"), validation=0), length=6)
     seen = data.source.pictures(data.sequences("test", torch.arange(1), 4).observation)
 
-    assert Beginnings(data, 4, mean_frame).nearest(seen, 1).tolist() == [[1]]
-    pictures = Beginnings(data, 4, last_frame).pictures
+    assert TrainingPrefixes(data, 4, mean_frame).nearest(seen, 1).tolist() == [[1]]
+    pictures = TrainingPrefixes(data, 4, last_frame).pictures
     assert torch.equal(pictures[0], pictures[1])
 
 
-def test_similar_digits_stand_in_for_completions(model, data, beginnings, judges):
+def test_similar_digits_stand_in_for_completions(model, data, prefixes, classifiers):
     """Digits of the training split are found for themselves first, and complete themselves without error."""
-    few = prefixes(data, "train", 3, CONTEXT, judges.prefix)
+    few = select_prefixes(data, "train", 3, CONTEXT, classifiers.prefix)
 
-    readings = score_split(model, few.batches(data, "train"), neighbour_pass(data, CONTEXT, 2, judges)).values
+    readings = score_split(model, few.batches(data, "train"), neighbour_scorer(data, CONTEXT, 2, classifiers)).values
 
     assert readings["best"][:, -1].abs().max() == 0
     assert readings["grey"].abs().max() == 0
 
 
-def test_written_strokes_are_read_as_whole_frames_are(model, data, beginnings, judges):
+def test_written_strokes_are_read_as_whole_frames_are(model, data, prefixes, classifiers):
     written = SequenceDataModule(Strokes(frames="written"), length=LENGTH)
 
-    few, same = (prefixes(each, "test", 3, CONTEXT, judges.prefix) for each in (data, written))
+    few, same = (select_prefixes(each, "test", 3, CONTEXT, classifiers.prefix) for each in (data, written))
 
     assert torch.equal(few.reference, same.reference)
-    for one in (truth_pass, lambda data, *rest: neighbour_pass(data, CONTEXT, 2, judges)):
+    for one in (truth_scorer, lambda data, *rest: neighbour_scorer(data, CONTEXT, 2, classifiers)):
         whole, added = (
-            score_split(model, few.batches(each, "test"), one(each, CONTEXT, judges)).values for each in (data, written)
+            score_split(model, few.batches(each, "test"), one(each, CONTEXT, classifiers)).values
+            for each in (data, written)
         )
         assert all(torch.equal(added[name], values) for name, values in whole.items())

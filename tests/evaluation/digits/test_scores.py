@@ -25,7 +25,7 @@ def random(*shape):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-def test_the_divergence_is_0_for_equal_and_log_2_for_disjoint_distributions():
+def test_divergence_is_0_for_equal_and_log_2_for_disjoint():
     p = random(3, 10).softmax(-1)
     sure = torch.eye(10, dtype=torch.float64)
 
@@ -49,7 +49,7 @@ def expectation(score, pictures, chance, truth, count):
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_the_energy_score_has_no_bias_at_any_number_of_completions(count):
+def test_the_energy_score_is_unbiased_for_any_sample_count(count):
     pictures, truth = (random(3, PIXELS) > 0.5).double(), torch.ones(PIXELS, dtype=torch.float64)
     chance = [0.2, 0.3, 0.5]
 
