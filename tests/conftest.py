@@ -12,7 +12,17 @@ from forbes.commands.cli import main
 from forbes.runs import configuration, modules
 from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
 
+SLOW = ("commands", "callbacks", "runs", "faults", "test_contributing.py", "test_full_disk.py", "test_damaged_files.py")
+"""Folders and files of tests that go through the command line: `pytest -m "not slow"` leaves them out."""
+
 torch.set_num_threads(1)  # a second thread gains nothing on matrices of this size
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the slow tests."""
+    for item in items:
+        if item.path.relative_to(Path(__file__).parent).parts[0] in SLOW:
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -62,7 +62,7 @@ def test_a_model_that_knows_the_world_predicts_each_reward(steps):
         assert r2 == pytest.approx((1, 0), abs=1e-6)
 
 
-def test_a_model_that_ignores_actions_predicts_near_rewards_better():
+def test_a_model_blind_to_actions_predicts_near_rewards_better():
     episodes = [walk(40, seed) for seed in range(5)]
 
     predicted = [
