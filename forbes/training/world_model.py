@@ -132,9 +132,7 @@ class WorldModel(SeededModule):
             self.model.center = torch.zeros(observation_shape)
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.clip_norm = clip_norm
-        self.recorded: Callable[[SequenceBatch], LossTerm] | None = (
-            None  # `CudaGraph` sets it, in place of `total_loss`
-        )
+        self.recorded: Callable[[SequenceBatch], LossTerm] | None = None  # by `CudaGraph`, to replace `total_loss`
 
     adam_eps = 1e-7
     __signature__: ClassVar[inspect.Signature]
