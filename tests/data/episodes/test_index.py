@@ -200,7 +200,7 @@ def test_a_reader_of_a_lost_index_says_how_it_is_rebuilt(store, capsys):
 
     assert main(["data", "check", str(store)]) == 0
 
-    assert "3 episodes read, 3 whole" in capsys.readouterr().out
+    assert "3 episodes read, 3 intact" in capsys.readouterr().out
     assert whole(store) == [1, 2, 3]
 
 
