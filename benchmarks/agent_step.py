@@ -110,7 +110,7 @@ class Work:
         self.batch = self.loading()
         with torch.no_grad():
             _, self.filtered = self.agent.follow(self.batch)
-        self.losses: Callable[[SequenceBatch], tuple[Tensor, Any]] = self.agent.losses
+        self.losses: Callable[[SequenceBatch], tuple[Tensor, Any]] = self.agent.total_loss
         if device.type == "cuda":
             self.losses = Recording(self.agent, self.batch, self.precision)
 
@@ -128,7 +128,7 @@ class Work:
         """Form the gradients of world model and reward."""
         with self.precision():
             seen, filtered = self.agent.follow(self.batch)
-            loss, _ = self.agent.model_objective(filtered, seen, self.batch)
+            loss, _ = self.agent.model_loss(filtered, seen, self.batch)
         self._backward(loss)
 
     def imagination(self) -> None:
@@ -140,7 +140,7 @@ class Work:
     def update(self) -> None:
         """Make an update: the sum of all losses, gradients, clipping, Adam."""
         with self.precision():
-            loss, _ = self.agent.losses(self.batch)
+            loss, _ = self.agent.total_loss(self.batch)
         self._step(loss)
 
     def recorded(self) -> None:

@@ -23,6 +23,7 @@ from forbes.models import (
     ConvEncoder as ConvEncoder,
     MLPDecoder as MLPDecoder,
     MLPEncoder as MLPEncoder,
+    ModelParts as ModelParts,
     Normal as Normal,
     OneHot as OneHot,
     OnePixel as OnePixel,

@@ -2,8 +2,9 @@
 
 import errno
 from pathlib import Path
+from typing import Any
 
-__all__ = ["FULL", "ForbesError", "unwritable"]
+__all__ = ["FULL", "ForbesError", "require_at_least", "unwritable"]
 
 FULL = {
     errno.ENOSPC: "Make room, or choose another place",
@@ -23,10 +24,29 @@ class ForbesError(Exception):
         >>> forbes.Strokes(points_per_step=0)
         Traceback (most recent call last):
         ...
-        forbes.errors.ForbesError: Strokes: points_per_step is 0, expected at least 1.
+        forbes.errors.ForbesError: Strokes: points_per_step is 0, expected at least 1
     """
 
     exit_status = 2
+
+
+def require_at_least(least: float, where: str, **numbers: Any) -> None:
+    """Raise a ForbesError for the first number that is below a minimum, or is no number.
+
+    Args:
+        least: the minimum.
+        where: the name that the sentence begins with, e.g. that of the class.
+        **numbers: arguments by name; a configuration can set them to null.
+
+    Example:
+        >>> forbes.errors.require_at_least(1, "Strokes", points_per_step=0)
+        Traceback (most recent call last):
+        ...
+        forbes.errors.ForbesError: Strokes: points_per_step is 0, expected at least 1
+    """
+    for name, number in numbers.items():
+        if number is None or not number >= least:
+            raise ForbesError(f"{where}: {name} is {number}, expected at least {least}")
 
 
 def unwritable(path: Path | str, error: OSError) -> ForbesError:

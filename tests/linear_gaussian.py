@@ -12,7 +12,7 @@ from torch.distributions import MultivariateNormal
 from torch.nn.functional import linear
 
 from forbes.beliefs import FlowBelief, GaussianBelief
-from forbes.models import Normal, StateSpaceModel
+from forbes.models import ModelParts, Normal, StateSpaceModel
 from forbes.models.networks import Decoder, Encoder
 
 SCALE = 1e-3  # of h
@@ -46,7 +46,8 @@ def set_head(head, matrix, std):
 def linear_gaussian_model(belief, build=StateSpaceModel):
     """The process with q(s_t | s_{t-1}, o_t) = p(s_t | s_{t-1}, o_t), exact but for what later observations say."""
     torch.manual_seed(0)
-    model = build(belief, Pixels(), Emission(), Normal(NOISE, scale=1.0), 0, 2, 4, 4, 1)
+    sizes = {"action_dim": 0, "state_dim": 2, "hidden_dim": 4, "mlp_dim": 4, "mlp_layers": 1}
+    model = build(ModelParts(belief, Pixels(), Emission(), Normal(NOISE, scale=1.0), **sizes))
     eye = torch.eye(2)
     both = torch.cat((torch.cat((eye, -eye), 1), torch.cat((-eye, eye), 1)))  # (x⁺, x⁻) to (x, -x)
     precision = 1 / SPREAD**2 + EMISSION.square().sum(0) / NOISE**2  # of the posterior, diagonal

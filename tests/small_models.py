@@ -14,6 +14,7 @@ from forbes.models import (
     Bernoulli,
     MLPDecoder,
     MLPEncoder,
+    ModelParts,
     ParticleModel,
     State,
     StateSpaceModel,
@@ -23,42 +24,45 @@ from forbes.models import (
 BATCH, TIME, ACTION, STATE, HIDDEN = 5, 6, 2, 4, 7
 SHAPE = (1, 6, 6)
 FLOW = partial(FlowBelief, layers=3, width=8)
-STATE_SPACE = {
-    "gaussian": partial(StateSpaceModel, GaussianBelief),
-    "flow": partial(StateSpaceModel, FLOW),
-    "flow in the posterior": partial(StateSpaceModel, FLOW, prior=GaussianBelief),
-    "flow in the prior": partial(StateSpaceModel, GaussianBelief, prior=FLOW),
-    "spline flow": partial(StateSpaceModel, partial(FLOW, coupling="spline", bins=4)),
-    "mixture": partial(StateSpaceModel, partial(MixtureBelief, components=3)),
-    "categorical": partial(StateSpaceModel, partial(CategoricalBelief, classes=2)),
+BELIEFS = {
+    "gaussian": GaussianBelief,
+    "flow": FLOW,
+    "spline flow": partial(FLOW, coupling="spline", bins=4),
+    "mixture": partial(MixtureBelief, components=3),
+    "categorical": partial(CategoricalBelief, classes=2),
 }
-MODELS = STATE_SPACE | {
-    "particles": partial(ParticleModel, GaussianBelief, particles=3),
-    "soft particles": partial(ParticleModel, FLOW, particles=3, resampling="soft"),
-    "vector": partial(VectorModel, GaussianBelief, overshoot=2, state_dim=0),
+STATE_SPACE = [*BELIEFS, "flow in the posterior", "flow in the prior"]
+MODELS = dict.fromkeys(STATE_SPACE, StateSpaceModel) | {
+    "particles": partial(ParticleModel, particles=3),
+    "soft particles": partial(ParticleModel, particles=3, resampling="soft"),
+    "vector": partial(VectorModel, overshoot=2),
 }
-
-
-class Bernoulli64(Bernoulli):
-    """Pixels for a model in float64."""
-
-    def target(self, observation):
-        return observation.double()
+PARTS = {
+    kind: {"belief": belief} for kind, belief in BELIEFS.items()
+} | {  # where they differ from those of `make_model`
+    "flow in the posterior": {"belief": FLOW, "prior": GaussianBelief},
+    "flow in the prior": {"belief": GaussianBelief, "prior": FLOW},
+    "particles": {},
+    "soft particles": {"belief": FLOW},
+    "vector": {"state_dim": 0},
+}
 
 
 def make_model(kind, action_dim=ACTION, width=9, seed=0):
-    state_dim = MODELS[kind].keywords.get("state_dim", STATE)
+    changes = PARTS[kind]
     torch.manual_seed(seed)
-    return MODELS[kind](
+    parts = ModelParts(
+        belief=GaussianBelief,
         encoder=MLPEncoder(SHAPE, width, layers=1),
-        decoder=MLPDecoder(HIDDEN + state_dim, SHAPE, width, layers=1),
-        likelihood=Bernoulli64(),
+        decoder=MLPDecoder(HIDDEN + changes.get("state_dim", STATE), SHAPE, width, layers=1),
+        likelihood=Bernoulli(),
         action_dim=action_dim,
-        state_dim=state_dim,
+        state_dim=STATE,
         hidden_dim=HIDDEN,
         mlp_dim=width,
         mlp_layers=2,
-    ).double()
+    )
+    return MODELS[kind](parts._replace(**changes)).double()
 
 
 def random_model(kind, seed=0):

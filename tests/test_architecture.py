@@ -8,7 +8,19 @@ import pytest
 FORBES = Path(__file__).parents[1] / "forbes"
 MODULES = sorted(FORBES.rglob("*.py"))
 
-FOUNDATION = ["errors", "files", "reading", "child", "choices", "configured", "frozen", "named", "seeding", "shapes"]
+FOUNDATION = [
+    "errors",
+    "files",
+    "reading",
+    "child",
+    "choices",
+    "configured",
+    "densities",
+    "frozen",
+    "named",
+    "seeding",
+    "shapes",
+]
 FOUNDATION += ["signatures"]
 PACKAGES = ["performance", "beliefs", "models", "control", "pomdps", "envs", "data", "runs", "training", "evaluation"]
 PACKAGES += ["figures", "callbacks", "commands"]

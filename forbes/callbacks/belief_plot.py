@@ -17,7 +17,7 @@ from torch import Tensor
 from forbes.beliefs import BeliefHead
 from forbes.callbacks.picture import PictureCallback, require_state, to_device
 from forbes.data import SequenceDataModule
-from forbes.errors import ForbesError
+from forbes.errors import require_at_least
 from forbes.evaluation.predictions import first_of_each_class
 from forbes.figures.style import BLACK, BLUE, GREY, ORANGE, PAGE, density_map, paper_style
 from forbes.models import StateSpaceModel
@@ -48,9 +48,8 @@ class BeliefPlot(PictureCallback):
 
     def __init__(self, digits: int = 2, columns: int = 6, samples: int = 2000, every: int = 5) -> None:
         super().__init__(every)
-        for name, value, least in [("digits", digits, 1), ("columns", columns, 1), ("samples", samples, 3)]:
-            if value < least:
-                raise ForbesError(f"BeliefPlot: {name} is {value}, expected at least {least}.")
+        require_at_least(1, "BeliefPlot", digits=digits, columns=columns)
+        require_at_least(3, "BeliefPlot", samples=samples)
         self.digits, self.columns, self.samples = digits, columns, samples
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

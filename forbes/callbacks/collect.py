@@ -13,7 +13,7 @@ from torch import Tensor
 from forbes.data import Experience
 from forbes.data.episodes.collection import random_policy
 from forbes.data.episodes.episode import Episode
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.evaluation.reward_prediction import predict_rewards, r2_score
 from forbes.files import require_room
 from forbes.seeding import derive_seed
@@ -58,9 +58,7 @@ class Collect(Callback):
         overlap: bool = False,
     ) -> None:
         numbers = {"seed_episodes": seed_episodes, "evaluate_every": evaluate_every}
-        for name, value in (numbers | {"evaluation_episodes": evaluation_episodes}).items():
-            if value < 1:
-                raise ForbesError(f"Collect: {name} is {value}, expected at least 1")
+        require_at_least(1, "Collect", **numbers, evaluation_episodes=evaluation_episodes)
         self.seed_episodes, self.overlap = seed_episodes, overlap
         self.evaluate_every, self.evaluation_episodes = evaluate_every, evaluation_episodes
 

@@ -1,4 +1,4 @@
-"""An update recorded once on a GPU, and played back: none of its thousands of kernels waits for Python any more."""
+"""Record an update once on a GPU and replay it, so that none of its thousands of kernels waits for Python."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.performance.fusion import fusing
-from forbes.training.world_model import WorldModel, together
+from forbes.training.world_model import LossTerm, WorldModel, sum_of_terms
 
 __all__ = ["CudaGraph", "Recording"]
 
@@ -23,55 +23,55 @@ _WARM_UP = 3
 class CudaGraph(Callback):
     """Records the losses of an update and their gradients as a CUDA graph, before the first update of a fit.
 
-    Every update then copies its batch to where the first one lay, and plays it back: the same kernels with new noise,
-    started by the device itself. What is elementwise between matrix products is one kernel
-    (`performance.fusion`). Clipping and Adam stay as they are. The numbers are those of a training without it, up to
-    rounding. `benchmarks/gpu.md` has the gain; compilers take about a minute before the first update. On a CPU it does
-    nothing.
+    It sets `WorldModel.recorded`. Every update then copies its batch to the memory of the first one and replays the
+    graph: the same kernels with new noise, launched by the device itself. Elementwise operations between two matrix
+    products are one kernel (`performance.fusion`). Clipping and Adam stay outside. The results are those of a training
+    without it, up to rounding. `benchmarks/gpu.md` has the gain; compilation takes about a minute before the first
+    update. On a CPU it does nothing.
 
     Args:
-        tf32: in the update, form products of float32 numbers from 10 bits of their mantissas, three digits: faster.
+        tf32: whether the update multiplies float32 matrices with 10 bits of their mantissas (three digits); faster.
 
     Raises:
-        ForbesError: where no world model learns, the loss changes from update to update by itself (`kl_warmup`), the
-            program waits for a number from the device, or there is no triton or C compiler.
+        ForbesError: if the module is not a WorldModel, `kl_warmup` is set (the loss would change between replays), the
+            update synchronises with the host, or there is no triton or C compiler.
     """
 
     def __init__(self, tf32: bool = False) -> None:
         self.tf32 = tf32
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse what cannot be recorded."""
+        """Refuse modules that cannot be recorded."""
         if not isinstance(pl_module, WorldModel):
             name = type(pl_module).__name__
             raise ForbesError(f"CudaGraph: found a {name}, expected a WorldModel or an agent. Leave CudaGraph out")
         if pl_module.kl_warmup:
-            raise ForbesError("CudaGraph: kl_warmup weighs every update anew, expected 0. Leave one of them out")
+            raise ForbesError("CudaGraph: kl_warmup changes the loss between updates, expected 0. Leave one out")
 
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: SequenceBatch, batch_idx: int
     ) -> None:
-        """Record; the module seeds the noise of its update after this."""
+        """Record the first update. The module seeds its noise after this."""
         module = cast(WorldModel, pl_module)
-        if batch.mask.is_cuda and "losses" not in vars(module):
+        if batch.mask.is_cuda and module.recorded is None:
             with _float32_products("high" if self.tf32 else "highest"):
-                vars(module)["losses"] = Recording(module, batch, trainer.precision_plugin.forward_context)
+                module.recorded = Recording(module, batch, trainer.precision_plugin.forward_context)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Restore the losses of the module itself."""
-        vars(pl_module).pop("losses", None)
+        """Let the module compute its losses itself again."""
+        cast(WorldModel, pl_module).recorded = None
 
 
 class Recording:
-    """The losses of a module on a GPU, with their gradients, for batches of the same shapes.
+    """The loss of a module on a GPU, with its gradients, for batches of the same shapes.
 
-    All kernels are one graph. The objectives, which do not depend on each other, are branches of it, gradients
-    included: each alone is too small to fill the device.
+    All kernels are one graph. The terms of the loss, which do not depend on each other, are branches of it, with their
+    gradients: each alone is too small to fill the device.
 
     Args:
-        module: in training mode; its parameters may change their values, not their memory.
-        batch: any.
-        precision: gives the context of the training's mixed precision.
+        module: the module in training mode; its parameters may change their values, not their memory.
+        batch: any batch.
+        precision: returns the context of the training's mixed precision.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Recording:
             with fusing():
                 self._warm_up()
                 with torch.cuda.graph(self.graph):
-                    self.loss, self.values, self.gradients = self._compute()
+                    (self.loss, self.logs), self.gradients = self._compute()
         except RuntimeError as error:  # of CUDA, and of the compiler
             name, reason = type(module).__name__, str(error).strip().partition("\n")[0]
             raise ForbesError(
@@ -93,16 +93,16 @@ class Recording:
                 "the device, and needs triton and a C compiler. Leave CudaGraph out"
             ) from error
 
-    def __call__(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """See `WorldModel.losses`."""
+    def __call__(self, batch: SequenceBatch) -> LossTerm:
+        """See `WorldModel.total_loss`."""
         for ours, theirs in zip(self.batch, batch, strict=True):
             ours.copy_(theirs)
         self.graph.replay()
-        loss: Tensor = _Played.apply(self.loss, self.gradients, *self.parameters)  # type: ignore[no-untyped-call]
-        return loss, {name: value.clone() for name, value in self.values.items()}
+        loss: Tensor = _Replayed.apply(self.loss, self.gradients, *self.parameters)  # type: ignore[no-untyped-call]
+        return LossTerm(loss, {name: value.clone() for name, value in self.logs.items()})
 
     def _warm_up(self) -> None:
-        """Compute on another stream, as PyTorch asks for: the compiler and libraries make ready."""
+        """Compute on another stream first, as PyTorch requires, so that compiler and libraries are initialised."""
         here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
         aside.wait_stream(here)
         with torch.cuda.stream(aside):
@@ -110,25 +110,24 @@ class Recording:
                 self._compute()
         here.wait_stream(aside)
 
-    def _compute(self) -> tuple[Tensor, dict[str, Tensor], list[Tensor | None]]:
-        """Return the loss, what is logged of it, and each parameter's gradient, where it has one."""
+    def _compute(self) -> tuple[LossTerm, list[Tensor | None]]:
+        """Return the loss, and the gradient of each parameter that has one."""
         with self.precision():
-            objectives = self.module.objectives(self.batch)  # holds what branches share until all are done
+            loss_terms = self.module.loss_terms(self.batch)  # holds what they share until all are done
         here = torch.cuda.current_stream()
-        streams = [here, *_streams(len(objectives) - 1)]
+        streams = [here, *_streams(len(loss_terms) - 1)]
         for stream in streams[1:]:
             stream.wait_stream(here)
-        found, gradients_of = [], []
-        for objective, stream in zip(objectives, streams, strict=True):
+        terms, gradients_of = [], []
+        for compute, stream in zip(loss_terms, streams, strict=True):
             with torch.cuda.stream(stream):
                 with self.precision():
-                    loss, values = objective()
+                    loss, logs = compute()
                 gradients_of.append(torch.autograd.grad(loss, self.parameters, allow_unused=True))
-            found.append((loss.detach(), values))
+            terms.append(LossTerm(loss.detach(), logs))
         for stream in streams[1:]:
             here.wait_stream(stream)
-        loss, values = together(found)
-        return loss, values, [_sum(each) for each in zip(*gradients_of, strict=True)]
+        return sum_of_terms(terms), [_sum(gradients) for gradients in zip(*gradients_of, strict=True)]
 
 
 @contextmanager
@@ -141,8 +140,8 @@ def _float32_products(precision: str) -> Iterator[None]:
         torch.set_float32_matmul_precision(before)
 
 
-class _Played(torch.autograd.Function):
-    """Gives a recorded loss, and when asked for its gradients, the recorded ones."""
+class _Replayed(torch.autograd.Function):
+    """Returns a recorded loss, and in the backward pass the recorded gradients."""
 
     @staticmethod
     def forward(ctx: Any, loss: Tensor, gradients: list[Tensor | None], *parameters: Tensor) -> Tensor:
@@ -157,11 +156,11 @@ class _Played(torch.autograd.Function):
 
 @cache
 def _streams(number: int) -> list[torch.cuda.Stream]:
-    """Return streams, the same ones for the gradients' kernels."""
+    """Return streams, the same ones in every call, since gradients run on those of their loss."""
     return [torch.cuda.Stream() for _ in range(number)]
 
 
 def _sum(gradients: tuple[Tensor | None, ...]) -> Tensor | None:
-    """Add what there is."""
+    """Return the sum of the gradients that exist."""
     found = [each for each in gradients if each is not None]
     return torch.stack(found).sum(0) if len(found) > 1 else next(iter(found), None)

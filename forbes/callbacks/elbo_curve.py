@@ -40,7 +40,7 @@ class ElboCurve(PictureCallback):
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """See `PictureCallback`."""
         metrics = read_metrics(str(trainer.log_dir))
-        names = [module.objective_name, *module.model.parts]
+        names = [module.objective_name, *module.model.logged_terms]
         has_kl = "kl" in names
         with paper_style():
             figure = Figure((PAGE, 4.2 if has_kl else 2.3), layout="constrained")

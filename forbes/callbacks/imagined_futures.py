@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from forbes.callbacks.picture import PictureCallback, require_context, require_frames, shown_sequences
 from forbes.data import SequenceBatch, SequenceDataModule
-from forbes.errors import ForbesError
+from forbes.errors import require_at_least
 from forbes.evaluation.predictions import complete
 from forbes.figures import imagination
 from forbes.training.world_model import WorldModel
@@ -33,9 +33,7 @@ class ImaginedFutures(PictureCallback):
 
     def __init__(self, samples: int = 6, context: int = 5, columns: int = 12, every: int = 5) -> None:
         super().__init__(every)
-        for name, value in [("samples", samples), ("context", context), ("columns", columns)]:
-            if value < 1:
-                raise ForbesError(f"ImaginedFutures: {name} is {value}, expected at least 1. Choose more")
+        require_at_least(1, "ImaginedFutures", samples=samples, context=context, columns=columns)
         self.samples, self.context, self.columns = samples, context, columns
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -11,7 +11,7 @@ from forbes.callbacks.picture import (
     shown_sequences,
 )
 from forbes.data import SequenceDataModule
-from forbes.errors import ForbesError
+from forbes.errors import require_at_least
 from forbes.evaluation.predictions import open_loop
 from forbes.figures import imagination
 from forbes.models import StateSpaceModel
@@ -40,13 +40,8 @@ class OpenLoopPanel(PictureCallback):
 
     def __init__(self, sequences: int = 3, context: int = 5, columns: int = 15, every: int = 5) -> None:
         super().__init__(every)
-        for name, value, least in [
-            ("sequences", sequences, 1),
-            ("context", context, 1),
-            ("columns", columns, context + 1),
-        ]:
-            if value < least:
-                raise ForbesError(f"OpenLoopPanel: {name} is {value}, expected at least {least}. Choose more")
+        require_at_least(1, "OpenLoopPanel", sequences=sequences, context=context)
+        require_at_least(context + 1, "OpenLoopPanel", columns=columns)
         self.sequences, self.context, self.columns = sequences, context, columns
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -11,7 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 from matplotlib.figure import Figure
 
 from forbes.data import SequenceBatch, SequenceDataModule
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.evaluation.predictions import first_of_each_class
 from forbes.figures.grids import require_images
 from forbes.figures.style import save_figure
@@ -44,8 +44,7 @@ class FileCallback(Callback, ABC):
     """Of the file."""
 
     def __init__(self, every: int = 5) -> None:
-        if every < 1:
-            raise ForbesError(f"{type(self).__name__}: every is {every}, expected at least 1.")
+        require_at_least(1, type(self).__name__, every=every)
         self.every = every
 
     @abstractmethod

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from forbes.callbacks.picture import PictureCallback, require_context, require_frames, to_device
 from forbes.data import SequenceDataModule
-from forbes.errors import ForbesError
+from forbes.errors import require_at_least
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import BLUE
@@ -32,9 +32,7 @@ class PredictionGrid(PictureCallback):
 
     def __init__(self, digits: int = 10, samples: int = 6, context: int = 15, every: int = 5) -> None:
         super().__init__(every)
-        for name, value in [("digits", digits), ("samples", samples), ("context", context)]:
-            if value < 1:
-                raise ForbesError(f"PredictionGrid: {name} is {value}, expected at least 1.")
+        require_at_least(1, "PredictionGrid", digits=digits, samples=samples, context=context)
         self.digits, self.samples, self.context = digits, samples, context
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -4,6 +4,7 @@ import argparse
 import itertools
 import logging
 import signal
+import sys
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
-import forbes.callbacks  # noqa: F401  so that configurations know them by their short names
+import forbes.callbacks  # so that configurations know them by their short names
 from forbes.callbacks.divergence import StopAtDivergence
 from forbes.commands.lower_rate import MOST, LowerRateError, at_half_the_rate
 from forbes.commands.parsers.fit import DESCRIPTION, run_options
@@ -48,6 +49,8 @@ from forbes.runs.stop import StopOnSignal
 from forbes.training.divergence import DivergedError
 
 __all__ = ["fit", "predict", "test", "validate"]
+
+sys.modules["forbes.training.callbacks"] = forbes.callbacks  # the configurations of older runs have it
 
 _LIMITS = ("max_epochs", "max_steps", "max_time", "limit_train_batches")
 

@@ -76,7 +76,7 @@ def first_not_finite(module: WorldModel | KnownBelief, failure: Mapping[str, Any
         _stand_before(module, failure["update"], number)
         module.on_train_batch_start(batch, batch_idx=1)  # seeds the noise; 0 would check the data of an epoch
         with torch.autocast(device, torch.bfloat16, enabled=failure["precision"].startswith("bf16")):
-            loss, terms = module.losses(batch) if isinstance(module, WorldModel) else (module.loss(batch), {})
+            loss, terms = module.total_loss(batch) if isinstance(module, WorldModel) else (module.loss(batch), {})
         for name, values in terms.items():
             watch.look(f"the loss term {name}", values)
         watch.look("the loss", loss)

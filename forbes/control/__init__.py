@@ -1,1 +1,1 @@
-"""Acting on a belief: λ-returns, actor and critic, and a planner."""
+"""Acting on a belief: an agent in an episode, its policy, imagination and losses (algorithm 1), and a planner."""

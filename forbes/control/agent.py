@@ -1,4 +1,4 @@
-"""An agent in an episode: it filters what it is shown, and acts on its belief."""
+"""An agent in an episode: it filters its observations, and acts on its belief."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -17,22 +17,22 @@ from forbes.seeding import derive_seed
 __all__ = ["ActionSelector", "Agent", "explore", "follow_plan", "greedy", "noisy"]
 
 ActionSelector: TypeAlias = Callable[[Filtered], Tensor]
-"""What to do at the last step of K filtered trajectories, `(K, 1, …)`: an action, `(1, A)`, in [-1, 1] or one-hot."""
+"""Select the action at the last step of K filtered trajectories: `(K, 1, …)` to `(1, A)`, in [-1, 1] or one-hot."""
 
 
 class Agent:
-    r"""Plays one episode: shown o_t, it moves its belief on and gives a_t.
+    r"""Plays one episode: given o_t, it updates its belief and returns a_t.
 
     .. math:: f_t^k = [h_t^k, s_t^k] \sim q(\cdot \mid o_{1:t}, a_{1:t-1}), \qquad
               a_t = \mathrm{choice}(f_t^1, \dots, f_t^K)
 
-    With K = 1, as in the paper, it acts on one guess of its state; more of them tell how certain it can be.
+    With K = 1, as in the paper, it acts on one sample of its state; more samples represent its uncertainty.
 
     Args:
-        model: in eval mode.
+        model: the world model, in eval mode.
         select_action: see `ActionSelector`; e.g. `greedy(actor)`.
-        seed: of everything that is drawn; step t depends on (seed, t) and on what was shown.
-        samples: K, trajectories of the posterior.
+        seed: random seed of all samples; step t depends on (seed, t) and on the observations.
+        samples: trajectories of the posterior, K.
     """
 
     def __init__(self, model: StateSpaceModel, select_action: ActionSelector, seed: int, samples: int = 1) -> None:
@@ -42,7 +42,7 @@ class Agent:
 
     @torch.no_grad()
     def __call__(self, observation: NDArray[Any]) -> NDArray[np.float32]:
-        """Act on o_t, in the form it is stored in: `(*O)` to `(A,)`."""
+        """Act on o_t, in its stored form: `(*O)` to `(A,)`."""
         device = self.action.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(derive_seed(self.seed, "act", self.steps))
@@ -57,10 +57,10 @@ class Agent:
 
 
 def greedy(actor: Actor) -> ActionSelector:
-    r"""Take the most probable action, as for an evaluation; of K trajectories, what they agree on.
+    r"""Take the most probable action, as in an evaluation; with K trajectories, the mean or the majority.
 
     .. math:: a = \tfrac1K \sum_k \mathrm{mode}\,\pi(\cdot \mid f^k), \qquad
-              \text{of discrete actions the one that most trajectories choose}
+              \text{for discrete actions the one that most trajectories select}
     """
 
     def select_action(filtered: Filtered) -> Tensor:
@@ -75,7 +75,7 @@ def explore(actor: Actor, amount: float) -> ActionSelector:
 
     Args:
         actor: the policy.
-        amount: standard deviation of the noise; of discrete actions the probability of a uniformly random one.
+        amount: standard deviation of the noise; for discrete actions the probability of a uniformly random one.
     """
 
     def select_action(filtered: Filtered) -> Tensor:
@@ -86,36 +86,36 @@ def explore(actor: Actor, amount: float) -> ActionSelector:
 
 
 def _agreed(action: Tensor, discrete: bool) -> Tensor:
-    """Return the mean of K actions, or the commonest, `(K, A)` to `(1, A)`."""
+    """Return the mean of K actions, or the most frequent one, `(K, A)` to `(1, A)`."""
     mean = action.mean(0, keepdim=True)  # (1, A)
     return one_hot_of(mean.argmax(-1, keepdim=True), mean) if discrete else mean
 
 
 def noisy(select_action: ActionSelector, noise: float) -> ActionSelector:
-    """Add N(0, noise²) to a choice, and clip to [-1, 1]."""
+    """Add N(0, noise²) to the selected action, and clip it to [-1, 1]."""
 
-    def choose_nearby(filtered: Filtered) -> Tensor:
+    def select_nearby(filtered: Filtered) -> Tensor:
         action = select_action(filtered)
         return (action + noise * torch.randn_like(action)).clamp(-1, 1)
 
-    return choose_nearby
+    return select_nearby
 
 
 def _epsilon_greedy(select_action: ActionSelector, chance: float) -> ActionSelector:
-    """Replace a discrete choice by one of all alike, with a probability (ε-greedy)."""
+    """Replace a discrete action by a uniformly random one with probability `chance` (ε-greedy)."""
 
-    def choose_or_draw(filtered: Filtered) -> Tensor:
+    def select_or_draw(filtered: Filtered) -> Tensor:
         action = select_action(filtered)  # (1, A)
         drawn = one_hot_of(torch.randint(action.shape[-1], (1, 1), device=action.device), action)
         return torch.where(torch.rand(1, 1, device=action.device) < chance, drawn, action)
 
-    return choose_or_draw
+    return select_or_draw
 
 
 def follow_plan(model: StateSpaceModel, reward: Callable[[Tensor], Tensor], search: CrossEntropy) -> ActionSelector:
-    """Search again at each step, every candidate on a sample of the belief of its own (PlaNet).
+    """Plan at each step, each candidate from its own sample of the belief (PlaNet).
 
-    Of K trajectories, the candidates take turns.
+    With K trajectories, the candidates take turns.
     """
 
     def select_action(filtered: Filtered) -> Tensor:

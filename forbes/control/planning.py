@@ -16,25 +16,26 @@ __all__ = ["CrossEntropy", "plan"]
 
 
 class CrossEntropy(NamedTuple):
-    """The search; defaults are PlaNet's."""
+    """Settings of the search; the defaults are PlaNet's."""
 
     horizon: int = 12
-    """H, agent steps."""
+    """Agent steps of a plan, H."""
     iterations: int = 10
+    """Iterations of the search."""
     candidates: int = 1000
-    """J."""
+    """Action sequences per iteration, J."""
     best: int = 100
-    """M."""
+    """Number of elites, M."""
 
     def maximise(self, objective: Callable[[Tensor], Tensor], mean: Tensor) -> Tensor:
-        """Search the action sequences with the highest objective, for each of B situations at once.
+        """Search the action sequences with the highest objective, for B situations at once.
 
         Args:
-            objective: of actions `(J, B, H, A)`, `(J, B)`.
-            mean: where to start, `(B, H, A)`, with standard deviation 1.
+            objective: maps actions `(J, B, H, A)` to `(J, B)`.
+            mean: initial mean, `(B, H, A)`; the initial standard deviation is 1.
 
         Returns:
-            The last mean, `(B, H, A)`, in [-1, 1].
+            The final mean, `(B, H, A)`, in [-1, 1].
         """
         std = torch.ones_like(mean)
         for _ in range(self.iterations):
@@ -50,18 +51,18 @@ class CrossEntropy(NamedTuple):
 def plan(
     model: StateSpaceModel, reward: Callable[[Tensor], Tensor], start: State, action_dim: int, search: CrossEntropy
 ) -> Tensor:
-    """Return the actions to take now: the first of the best sequences, by the sum of mean rewards of what they lead to.
+    """Return the first action of the sequence with the highest sum of predicted rewards.
 
     Args:
-        model: imagines.
-        reward: mean reward of features, `(*, F)` to `(*)`.
+        model: the world model.
+        reward: predicts the reward from features, `(*, F)` to `(*)`.
         start: J samples of the belief in each of B situations, `(J B, …)`, from `StateSpaceModel.sample_beliefs`;
-            each candidate is tried on one, so that what is chosen is good under the belief and not for one sample.
-        action_dim: A.
-        search: how to search.
+            each candidate is evaluated on one, so that the plan is good under the belief and not for one sample.
+        action_dim: dimensions of an action, A.
+        search: settings of the search.
 
     Returns:
-        `(B, A)`.
+        An action per situation, `(B, A)`.
     """
     number, rows = search.candidates, len(start.state) // search.candidates
 

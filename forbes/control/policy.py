@@ -21,14 +21,14 @@ class Policy(Protocol):
     """A distribution over actions, with batch shape `(*)`."""
 
     def rsample(self) -> tuple[Tensor, Tensor]:
-        """Draw an action with a gradient, and its log-probability in nats: `(*, A)` and `(*)`."""
+        """Sample an action, differentiably, with its log-probability in nats: `(*, A)` and `(*)`."""
 
     def mode(self) -> Tensor:
         """Return the most probable action, `(*, A)`."""
 
 
 class TanhNormal:
-    r"""A Gaussian squeezed into (-1, 1), independent over the action's dimensions.
+    r"""The tanh of a Gaussian, with values in (-1, 1), independent over the action's dimensions.
 
     .. math:: a = \tanh u, \quad u \sim N(\mu, \sigma^2), \qquad
               \log p(a) = \sum_i \log N(u_i; \mu_i, \sigma_i) - 2\,(\log 2 - u_i - \mathrm{softplus}(-2 u_i))
@@ -44,12 +44,12 @@ class TanhNormal:
         self.mean, self.std = mean, std
 
     def rsample(self, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-        """Draw a, reparameterised, and log p(a): `(*sample_shape, *, A)` and `(*sample_shape, *)`."""
+        """Sample a, reparameterised, with log p(a): `(*sample_shape, *, A)` and `(*sample_shape, *)`."""
         noise = torch.randn((*sample_shape, *self.mean.shape), dtype=self.mean.dtype, device=self.mean.device)
         return _squeeze(noise, self.mean, self.std)
 
     def mode(self) -> Tensor:
-        """Return the most probable of 100 samples, each distribution's own, `(*, A)`: there is no closed form."""
+        """Return the most probable of 100 samples per distribution, `(*, A)`; the mode has no closed form."""
         action, log_prob = self.rsample((_MODE_SAMPLES,))
         best = log_prob.argmax(0)  # (*)
         return action.gather(0, best[None, ..., None].expand(1, *action.shape[1:])).squeeze(0)  # (*, A)
@@ -57,7 +57,7 @@ class TanhNormal:
 
 @fused
 def _squeeze(noise: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the action that noise makes, `(*, A)`, and its log-probability, `(*)`."""
+    """Return tanh(μ + σ ε), `(*, A)`, and its log-probability, `(*)`."""
     before = torch.addcmul(mean, std, noise)  # (*, A)
     density = -0.5 * (noise.square() + math.log(2 * math.pi)) - std.log()
     log_prob = (density - 2 * (_LOG_2 - before - softplus(-2 * before))).sum(-1)  # (*)
@@ -74,8 +74,8 @@ def _bounded(numbers: Tensor, min_std: float) -> tuple[Tensor, Tensor]:
 class OneHotCategorical:
     r"""One of A actions, one-hot: :math:`\log p(a) = \sum_i a_i \log \mathrm{softmax}(x)_i`.
 
-    Gradients are straight-through, :math:`\partial a := \partial p` (DreamerV2, arXiv 2010.02193): biased where what
-    follows is not linear in the action, exact for the entropy as the mean of :math:`-\log p(a)`.
+    Gradients are straight-through, :math:`\partial a := \partial p` (DreamerV2, arXiv 2010.02193). They are biased
+    unless the objective is linear in the action, and exact for the entropy as the mean of :math:`-\log p(a)`.
 
     Args:
         logits: x, `(*, A)`.
@@ -94,16 +94,16 @@ class OneHotCategorical:
 
 
 class Actor(nn.Module):
-    r"""The policy q(a | features): a tanh-normal, almost bang-bang at the start (Dreamer, appendix A), of vectors.
+    r"""The policy q(a | features), a tanh-normal of vectors, close to ±1 at initialisation (Dreamer, appendix A).
 
     .. math:: \mu = 5 \tanh(x / 5), \qquad \sigma = \mathrm{softplus}(y + \log(e^5 - 1)) + \sigma_{min}
 
     Args:
-        feature_dim: F.
-        action_dim: A.
-        width: of each hidden layer.
-        layers: hidden layers.
-        discrete: an action is one of A, one-hot, and the policy a categorical.
+        feature_dim: dimensions of the features, F.
+        action_dim: dimensions of an action, A.
+        width: width of each hidden layer.
+        layers: number of hidden layers.
+        discrete: whether an action is one of A, one-hot, and the policy categorical.
         min_std: :math:`\sigma_{min}`, 1e-4 in Dreamer.
     """
 
@@ -130,12 +130,12 @@ class Actor(nn.Module):
 
 
 class ScalarHead(nn.Module):
-    """A number of the features: the reward that came with a state, or its value v, what the policy earns from there on.
+    """A scalar function of the features: the reward, the value v, or the logit of the continuation.
 
     Args:
-        feature_dim: F.
-        width: of each hidden layer.
-        layers: hidden layers.
+        feature_dim: dimensions of the features, F.
+        width: width of each hidden layer.
+        layers: number of hidden layers.
     """
 
     def __init__(self, feature_dim: int, width: int, layers: int) -> None:
@@ -143,6 +143,6 @@ class ScalarHead(nn.Module):
         self.net = nn.Sequential(MLP(feature_dim, width, layers), nn.Linear(width, 1))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return the number, `(*, F)` to `(*)`."""
+        """Return the scalar, `(*, F)` to `(*)`."""
         number: Tensor = self.net(features).to(features.dtype)
         return number.squeeze(-1)  # (*)

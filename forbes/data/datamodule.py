@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch, check_source
-from forbes.errors import ForbesError
+from forbes.errors import require_at_least
 
 __all__ = ["SequenceDataModule"]
 
@@ -83,14 +83,8 @@ class SequenceDataModule(LightningDataModule):
         validation_sequences: int = 1000,
     ) -> None:
         super().__init__()
-        for name, value in [
-            ("batch_size", batch_size),
-            ("length", length),
-            ("updates_per_epoch", updates_per_epoch),
-            ("validation_sequences", validation_sequences),
-        ]:
-            if value < 1:
-                raise ForbesError(f"SequenceDataModule: {name} is {value}, expected at least 1")
+        sizes = {"batch_size": batch_size, "length": length, "updates_per_epoch": updates_per_epoch}
+        require_at_least(1, "SequenceDataModule", **sizes, validation_sequences=validation_sequences)
         check_source(source)
         self.source, self.batch_size, self.length, self.seed = source, batch_size, length, seed
         self.updates_per_epoch = updates_per_epoch

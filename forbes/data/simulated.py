@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from forbes.data.source import SequenceBatch, SequenceSource, Split
-from forbes.errors import ForbesError
+from forbes.errors import require_at_least
 from forbes.pomdps import Process, Trajectories
 from forbes.pomdps.hmm import FiniteProcess
 from forbes.seeding import generator
@@ -52,9 +52,7 @@ class Simulated(SequenceSource):
     def __init__(
         self, process: Process, train: int = 10_000, validation: int = 1000, test: int = 1000, seed: int = 0
     ) -> None:
-        for name, value in (("train", train), ("validation", validation), ("test", test)):
-            if value < 1:
-                raise ForbesError(f"Simulated: {name} is {value}, expected at least 1 sequence.")
+        require_at_least(1, "Simulated", train=train, validation=validation, test=test)
         self.process, self.train, self.validation, self.test, self.seed = process, train, validation, test, seed
         self.observation_shape = (process.observation_dim,)
         self.action_dim, self.discrete = process.action_dim, isinstance(process, FiniteProcess)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.shapes import printed_by_shape
 
 __all__ = [
@@ -89,8 +89,7 @@ def repeat(frame: Callable[[], Step], times: int) -> Step:
 
 def require_repeat(where: str, action_repeat: int) -> None:
     """Raise a ForbesError unless an action is held for at least one frame."""
-    if action_repeat < 1:
-        raise ForbesError(f"{where}: action_repeat is {action_repeat}, expected at least 1. Choose another")
+    require_at_least(1, where, action_repeat=action_repeat)
 
 
 def finite_bounds(low: NDArray[Any], high: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

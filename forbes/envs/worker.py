@@ -95,8 +95,9 @@ class EnvironmentProcess(Environment):
         return step
 
     def describe(self) -> dict[str, Any]:
-        """See `Environment.describe`; with the limit of steps, which determines an episode too."""
-        return self._description | {"time_limit": self._time_limit}
+        """See `Environment.describe`; with the limit of steps, its own or the environment's, whichever comes first."""
+        own = self._description.get("time_limit", self._time_limit)
+        return self._description | {"time_limit": min(own, self._time_limit)}
 
     def close(self) -> None:
         """End the process, however busy it is."""

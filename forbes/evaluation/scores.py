@@ -8,8 +8,8 @@ does not count; logarithms and sums of probabilities in float64. With
 
     \mathrm{ELBO} &= E_q \sum_t \log w_t \;\le\;
     \mathrm{IWAE}_K = E \log \frac1K \sum_k \prod_t w_t^k \;\le\; \log p(o_{1:T}) \\
-    \mathrm{PLL} &= \sum_t \log \frac1K \sum_k p(o_t \mid h_t^k, \tilde s_t^k), \qquad
-    \tilde s_t^k \sim p(\cdot \mid h_t^k) \\
+    \mathrm{PLL} &= \sum_t \log \frac1K \sum_k \hat p(o_t \mid h_t^k), \qquad
+    E\, \hat p(o_t \mid h_t) = \int p(o_t \mid h_t, s)\, p(s \mid h_t)\, ds \\
     \mathrm{FIVO}_K &= E \sum_t \log \sum_k W_{t-1}^k w_t^k \;\le\; \log p(o_{1:T}) \\
     \mathrm{open\ loop} &= \log \frac1K \sum_k \prod_{t>c} p(o_t \mid h_t^k, s_t^k), \qquad
     (h_c, s_c)^k \sim \text{belief}, \quad (h_t, s_t)^k \sim \text{prior}
@@ -17,8 +17,9 @@ does not count; logarithms and sums of probabilities in float64. With
 - IWAE (Burda et al., 2016, arXiv 1509.00519): the product over time is inside the mean over particles.
 - The PLL, a prequential log-likelihood, scores the filtering belief: its particles are drawn from the belief after
   t - 1 observations (h_t follows from it) and see o_t only in their score, so it is a proper score of the belief, and
-  its K-sample form a lower bound of itself (Jensen). A model that draws weighted sets of particles has their weights in
-  the mean, one without randomness has K = 1.
+  its K-sample form a lower bound of itself (Jensen). The posterior helps to estimate the integral over s_t, without
+  bias (`StateSpaceModel.one_step_log_prob`). A model that draws weighted sets of particles has their weights in the
+  mean, one without randomness has K = 1.
 - FIVO (Maddison et al., 2017, arXiv 1705.09279) resamples, with the particles of `forbes.models.particles` and
   systematic resampling, whatever the model is trained by.
 - Open loop: the mean over particles is outside the product over time and inside the logarithm, so a belief is rewarded
@@ -55,7 +56,7 @@ class Trajectory(NamedTuple):
     kl: Tensor
     """log q(s_t) - log p(s_t), `(B, T)`."""
     prediction: Tensor | None
-    """log p(o_t | h_t, s̃_t) for s̃_t drawn from the prior given h_t, `(B, T)`; None where it was not asked for."""
+    """An estimate of log p(o_t | h_t) (`StateSpaceModel.one_step_log_prob`), `(B, T)`; None where it is not wanted."""
 
 
 class LogMeanExp:
@@ -103,9 +104,8 @@ def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, pred
         number: of trajectories.
         predict: whether to draw the one-step predictions too.
     """
-    encoded = model.encode(
-        batch.observation, batch.action
-    )  # once: coarse pixels have noise, the same for both networks
+    # Once: coarse pixels have noise, the same for both networks.
+    encoded = model.encode(batch.observation, batch.action)
     target = encoded.target.flatten(0, 1)  # (B T, *O)
 
     def log_prob(features: Tensor) -> Tensor:
@@ -114,8 +114,9 @@ def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, pred
     for _ in range(number):
         filtered = model.filter(encoded.embedding, encoded.action)
         kl = filtered.log_prob - model.prior_log_prob(filtered)
-        prediction = log_prob(model.predict(filtered)) if predict else None
-        yield Trajectory(log_prob(filtered.features), kl.double(), prediction)
+        reconstruction = log_prob(filtered.features)
+        prediction = model.one_step_log_prob(filtered, reconstruction, log_prob) if predict else None
+        yield Trajectory(reconstruction, kl.double(), prediction)
 
 
 @torch.no_grad()
@@ -151,9 +152,7 @@ def score_predictions(model: BeliefModel, batch: SequenceBatch, number: int) -> 
         return score_trajectories(model, batch, number, predict=True)  # its trajectories serve both
     encoded, prediction = model.encode(batch.observation, batch.action), LogMeanExp()
     for _ in range(model.num_belief_samples(number)):
-        features, log_weight = model.predict_one_step(encoded)
-        log_prob = frame_log_prob(model, features.flatten(1, 2), encoded.target.flatten(0, 1))  # (K, B T)
-        prediction.add((log_prob.view(log_weight.shape) + log_weight).logsumexp(0))  # (B, T)
+        prediction.add(model.predictive_log_prob(encoded, partial(frame_log_prob, model)))
     scores = {"pll": prediction.result() * batch.mask}
     if isinstance(model, StateSpaceModel):
         scores |= score_trajectories(model, batch, number, predict=False)

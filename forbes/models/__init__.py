@@ -1,6 +1,6 @@
 """State-space models as pure modules: they compute and return records, and never log."""
 
-from forbes.models.base import BeliefModel, EncodedSequence, ModelFamily, Prediction, Rollout, State
+from forbes.models.base import BeliefModel, EncodedSequence, ModelFamily, ModelParts, Rollout, State
 from forbes.models.elbo import ElboTerms, elbo_loss
 from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, OnePixel, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
@@ -21,13 +21,13 @@ __all__ = [
     "MLPDecoder",
     "MLPEncoder",
     "ModelFamily",
+    "ModelParts",
     "Normal",
     "OneHot",
     "OnePixel",
     "ParticleModel",
     "PixelDecoder",
     "PixelEncoder",
-    "Prediction",
     "Rollout",
     "State",
     "StateSpaceModel",

@@ -1,8 +1,8 @@
-r"""What training, evaluation and figures ask of a model, whatever its filter.
+r"""The interface of a belief model, which training, evaluation and figures use.
 
 .. math:: h_t = \mathrm{GRU}(h_{t-1}, \mathrm{MLP}(s_{t-1}, a_{t-1})), \qquad p(o_t \mid \text{features}_t)
 
-Every model carries a pair (h, s) along a sequence; what s is, and how it learns of o_t, is the model's own.
+Every model carries a pair (h, s) along a sequence. Models differ in what s is, and in how it is inferred from o_t.
 """
 
 from abc import ABC, abstractmethod
@@ -19,12 +19,12 @@ from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import MLP, Decoder, Encoder
 from forbes.shapes import printed_by_shape
 
-__all__ = ["BeliefModel", "EncodedSequence", "ModelFamily", "Prediction", "Rollout", "State"]
+__all__ = ["BeliefModel", "EncodedSequence", "FrameLogProb", "ModelFamily", "ModelParts", "Rollout", "State"]
 
 
 @printed_by_shape
 class State(NamedTuple):
-    """What the recurrence carries."""
+    """The state of the recurrence."""
 
     hidden: Tensor
     """h, `(*, H)`."""
@@ -39,7 +39,7 @@ class Rollout(NamedTuple):
     hidden: Tensor
     """h_t, `(B, T, H)`."""
     state: Tensor
-    """s_t, drawn from the prior, `(B, T, D)`."""
+    """s_t, sampled from the prior, `(B, T, D)`."""
     log_prob: Tensor
     """log p(s_t | h_t) in nats, `(B, T)`."""
 
@@ -51,7 +51,7 @@ class Rollout(NamedTuple):
 
 @printed_by_shape
 class EncodedSequence(NamedTuple):
-    """What a filter reads, encoded once for all the times it is read."""
+    """The input of a filter, encoded once for several runs of it."""
 
     target: Tensor
     """o_t as `Likelihood.target` or `Likelihood.sample` gives it, `(B, T, *O)`."""
@@ -61,113 +61,154 @@ class EncodedSequence(NamedTuple):
     """a_{t-1}, `(B, T, A)`."""
 
 
-@printed_by_shape
-class Prediction(NamedTuple):
-    r"""What a belief says of every next observation: :math:`p(o_t \mid o_{<t}) = \sum_k W^k p(o_t \mid x^k)`."""
+FrameLogProb: TypeAlias = Callable[[Tensor, Tensor], Tensor]
+"""log p(o | features) in nats: features `(*, N, F)` and N targets `(N, *O)`, each scored under every leading index, to
+`(*, N)`."""
 
-    features: Tensor
-    """x, of K particles, `(K, B, T, F)`; those of step t have seen nothing after o_{t-1}."""
-    log_weight: Tensor
-    """log W, normalised over the particles, `(K, B, T)`."""
+
+class ModelParts(NamedTuple):
+    """What a belief model is made of. `WorldModel` collects it from its arguments.
+
+    Example:
+        >>> parts = forbes.ModelParts(
+        ...     belief=forbes.GaussianBelief,
+        ...     encoder=forbes.MLPEncoder((3,)),
+        ...     decoder=forbes.MLPDecoder(20, (3,)),  # hidden_dim + state_dim inputs
+        ...     likelihood=forbes.VectorNormal(),
+        ...     action_dim=2,
+        ...     state_dim=4,
+        ...     hidden_dim=16,
+        ...     mlp_dim=16,
+        ...     mlp_layers=1,
+        ... )
+        >>> forbes.StateSpaceModel(parts).bound_name
+        'elbo[normal(1),S=1]'
+    """
+
+    belief: BeliefFamily
+    """Builds the head of the posterior, and that of the prior, from (state_dim, context_dim)."""
+    encoder: Encoder
+    """o_t to e_t."""
+    decoder: Decoder
+    """Features to the likelihood's parameters. Its input has `hidden_dim + state_dim` dimensions."""
+    likelihood: Likelihood
+    """What the decoder's output means."""
+    action_dim: int
+    """A, may be 0."""
+    state_dim: int
+    """D of s; 0 for a model without a stochastic state."""
+    hidden_dim: int
+    """H of h."""
+    mlp_dim: int
+    """Width of every MLP, and C of the belief's contexts."""
+    mlp_layers: int
+    """Layers of every MLP."""
+    prior: BeliefFamily | None = None
+    """Builds the head of the prior, where its family is another than `belief`."""
 
 
 class BeliefModel(Configurable, nn.Module, ABC):
     """A recurrent model that holds a belief: it filters, predicts, imagines and decodes.
 
-    To add one whose filter differs, copy `vector.py`: every abstract method below, and nothing else.
+    To add a model whose filter differs, copy `vector.py`. A subclass implements, in the order in which they are called:
+
+    - `bound_name`: the name of its training bound, by which the bound is logged.
+    - `lower_bound`: the bound on log p(o_1:T) of a batch, with its parts; training and validation.
+    - `initial`: (h_0, s_0), what the recurrence carries before the first observation.
+    - `sample_beliefs`: samples of the belief after the last observation; every forecast starts from them.
+    - `imagine`: a trajectory from such a sample, given actions and no observations.
+    - `predictive_log_prob`: an estimate of log p(o_t | o_1:t-1) of every step; scores.
+
+    It may override `num_belief_samples` and `logged_terms`. Everything else is shared.
 
     Args:
-        encoder: o_t to e_t.
-        decoder: features to the likelihood's parameters.
-        likelihood: what the decoder's output means.
-        input_dim: of (s, a), what moves the recurrence.
-        hidden_dim: H of h.
-        mlp_dim: width of the perceptron before the GRU.
-        mlp_layers: layers of it.
+        parts: what it is made of.
+        input_dim: dimensions of the input of the transition, before the GRU.
     """
 
-    parts: ClassVar[tuple[str, ...]] = ("reconstruction", "kl")
-    """What training logs beside the bound: parts of it, or names of `ElboTerms.auxiliary`."""
+    logged_terms: ClassVar[tuple[str, ...]] = ("reconstruction", "kl")
+    """What training logs in addition to the bound: its parts, or names of `ElboTerms.auxiliary`."""
     particles: int = 1
-    """How many of them one draw of the belief has."""
+    """Particles per sample of the belief."""
     center: Tensor | None
-    """The mean target, `(*O)`: encoder and decoder see what differs from it; None leaves both as they are."""
+    """The mean target, `(*O)`. Encoder and decoder then work on the difference to it; None leaves both as they are."""
 
-    def __init__(
-        self,
-        encoder: Encoder,
-        decoder: Decoder,
-        likelihood: Likelihood,
-        input_dim: int,
-        hidden_dim: int,
-        mlp_dim: int,
-        mlp_layers: int,
-    ) -> None:
+    def __init__(self, parts: ModelParts, input_dim: int) -> None:
         super().__init__()
-        self.hidden_dim = hidden_dim
-        self.encoder, self.decoder, self.likelihood = encoder, decoder, likelihood
-        self.transition = MLP(input_dim, mlp_dim, mlp_layers)
-        self.gru = nn.GRUCell(mlp_dim, hidden_dim)
+        self.hidden_dim = parts.hidden_dim
+        self.encoder, self.decoder, self.likelihood = parts.encoder, parts.decoder, parts.likelihood
+        self.transition = MLP(input_dim, parts.mlp_dim, parts.mlp_layers)
+        self.gru = nn.GRUCell(parts.mlp_dim, parts.hidden_dim)
         self.register_buffer("center", None)
 
     @property
     @abstractmethod
     def bound_name(self) -> str:
-        """Name the bound that `elbo` estimates, with its likelihood and its number of samples."""
+        """Name the bound that `lower_bound` estimates, with its likelihood and its number of samples."""
 
     @abstractmethod
     def initial(self, batch: int) -> State:
-        """Return (h_0, s_0), `(B, ...)`: what is carried before anything was seen."""
+        """Return (h_0, s_0), `(B, ...)`: the state before the first observation."""
 
     @abstractmethod
     def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
-        """Estimate the lower bound of log p(o_1:T) that the model is trained by.
+        """Estimate the lower bound on log p(o_1:T) that trains the model.
 
         Args:
-            observation: as in `SequenceBatch`, like the next two.
-            action: a_{t-1}.
-            mask: True where the step counts.
+            observation: o_t as stored, `(B, T, *O)`.
+            action: a_{t-1}, `(B, T, A)`.
+            mask: True where the step is no padding, `(B, T)`.
             kl: how the KL is differentiated, where the model has one.
         """
 
     @abstractmethod
     def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
-        """Draw N of the belief over (h, s) after the last step, given all that was seen: `(N B, ...)`, sample-major."""
+        """Sample (h, s) after the last step given all observations, N times each: `(N B, ...)`, sample-major."""
 
     @abstractmethod
-    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
-        """Predict every o_t from one draw of the belief after t - 1 steps, of `particles` particles."""
+    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
+        """Estimate log p(o_t | o_<t) of every step from one sample of the belief after t - 1 steps, in nats, `(B, T)`.
+
+        The exponential is unbiased, so that of several samples it is averaged. Step t depends on nothing after o_t.
+
+        Args:
+            encoded: B sequences of T steps.
+            log_likelihood: how frames are scored; evaluation has its own, in float64.
+        """
 
     @abstractmethod
     def imagine(self, start: State, action: Tensor) -> Rollout:
-        """Roll on from `start` without observations, each row on its own trajectory.
+        """Continue from `start` without observations, each row on its own trajectory.
 
         Args:
-            start: (h, s), `(B, ...)`; `beliefs` gives several per history.
-            action: a of each step, the one that leads to it, `(B, T, A)`.
+            start: (h, s), `(B, ...)`, e.g. from `sample_beliefs`.
+            action: the action that leads to each step, `(B, T, A)`.
 
         Returns:
-            T steps after `start`, which itself is not among them.
+            T steps after `start`, without `start` itself.
         """
 
     def num_belief_samples(self, number: int) -> int:
-        """Return how many independent draws of the belief make so many particles."""
+        """Return how many independent samples of the belief have `number` particles together."""
         return number
 
     def encode(self, observation: Tensor, action: Tensor) -> EncodedSequence:
-        """Read stored observations `(B, T, *O)` and the actions that led to them `(B, T, A)`."""
-        target = self.likelihood.target(observation)
+        """Encode stored observations `(B, T, *O)` and the actions that led to them `(B, T, A)`."""
+        target = self._target(observation)
         return EncodedSequence(target, self.embed_target(target), action)
 
     def embed(self, observation: Tensor) -> Tensor:
         """Encode every frame: stored observations `(B, T, *O)` to e `(B, T, E)`."""
-        return self.embed_target(self.likelihood.target(observation))
+        return self.embed_target(self._target(observation))
 
     def embed_target(self, target: Tensor) -> Tensor:
         """Encode every frame as `Likelihood.target` or `Likelihood.sample` gives it: `(B, T, *O)` to e `(B, T, E)`."""
         shown = target if self.center is None else target - self.center
         embedding: Tensor = self.encoder(shown.flatten(0, 1)).to(target.dtype)  # (B T, E)
         return embedding.view(*target.shape[:2], -1)  # (B, T, E)
+
+    def _target(self, observation: Tensor) -> Tensor:
+        return self.likelihood.target(observation).to(self.gru.weight_hh.dtype)
 
     def decode(self, features: Tensor) -> Tensor:
         """Return the likelihood's parameters: features `(*, F)` to `(*, *O)`."""
@@ -178,11 +219,10 @@ class BeliefModel(Configurable, nn.Module, ABC):
 
     def log_likelihood(self, features: Tensor, target: Tensor) -> Tensor:
         """Return log p(o | features) in nats: `(*, F)` and `(*, *O)`, which broadcast, to `(*)`."""
-        return self.likelihood.log_prob(self.decode(features).float(), target)
+        output = self.decode(features)
+        precise = torch.promote_types(output.dtype, torch.float32)  # in mixed precision the decoder's is bfloat16
+        return self.likelihood.log_prob(output.to(precise), target)
 
 
-ModelFamily: TypeAlias = Callable[
-    [BeliefFamily, Encoder, Decoder, Likelihood, int, int, int, int, int, BeliefFamily | None], BeliefModel
-]
-"""Builds a model from (belief, encoder, decoder, likelihood, action_dim, state_dim, hidden_dim, mlp_dim, mlp_layers,
-prior): a class of this package with its other arguments bound."""
+ModelFamily: TypeAlias = Callable[[ModelParts], BeliefModel]
+"""Builds a model from its parts: a class of this package with its other arguments bound."""

@@ -14,9 +14,9 @@ KL = Literal["analytic", "monte_carlo", "path"]
 """How the KL is differentiated; its expected gradient is the same.
 
 - analytic: the closed form where prior and posterior have one, else as path.
-- path: log q(s) - log p(s) at the posterior's sample, where log q is a function of s alone (`path_log_prob`); where
-  draws are not reparameterised, as monte_carlo.
-- monte_carlo: the same, where log q is a function of its parameters too.
+- path: log q(s) - log p(s) at the posterior's sample, with log q a function of s alone (`path_log_prob`); as
+  monte_carlo where samples are not reparameterised.
+- monte_carlo: the same, with log q a function of its parameters too.
 """
 
 
@@ -30,17 +30,17 @@ class ElboTerms(NamedTuple):
     reconstruction: Tensor
     """log p(o_t | features), `(B, T)`."""
     kl: Tensor
-    """log q(s_t) - log p(s_t) at the posterior's own sample, `(B, T)`: what is reported, for every family."""
+    """log q(s_t) - log p(s_t) at the posterior's own sample, `(B, T)`; reported for every family."""
     analytic_kl: Tensor | None
-    """The closed form of its expectation given (h_t, e_t), `(B, T)`, where it was asked for and the family has one."""
+    """The closed form of its expectation given (h_t, e_t), `(B, T)`, if it was requested and the family has one."""
     mask: Tensor
     """True where the step counts, `(B, T)`."""
     auxiliary: Mapping[str, Tensor] = {}
-    """Further losses by name, nats per step, scalars: for the loss only, a reported bound never has them."""
+    """Further losses by name, scalars in nats per step. They are part of the loss only, never of a reported bound."""
 
     @property
     def elbo(self) -> Tensor:
-        """J per sequence, padding left out, shape `(B,)`."""
+        """J per sequence without padding, shape `(B,)`."""
         return ((self.reconstruction - self.kl) * self.mask).sum(1)
 
     def mean_over_steps(self, values: Tensor) -> Tensor:
@@ -56,14 +56,14 @@ def elbo_loss(
     .. math:: L = \beta \max(\overline{KL_t},\, n) - \overline{\log p(o_t)}, \quad\text{or}\quad
               L = \beta\,\overline{\max(KL_t, n)} - \overline{\log p(o_t)}
 
-    The bar is the mean over batch and time, padding left out. The KL is the closed form where the terms have one.
-    Free nats and the weight are for the loss only; a reported bound never has them. Auxiliary losses are added.
+    The bar is the mean over batch and time without padding. The KL is the closed form where the terms have one. Free
+    nats and the weight are part of the loss only, never of a reported bound. Auxiliary losses are added.
 
     Args:
         terms: the parts of the bound.
         free_nats: n, in nats per step.
         free_nats_per: "batch" averages first (Dreamer, ours), "element" clips each step (PlaNet).
-        kl_weight: :math:`\beta`, 1 but for a warm-up.
+        kl_weight: :math:`\beta`, 1 except during a warm-up.
 
     Returns:
         L in nats per step, a scalar.

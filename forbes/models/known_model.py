@@ -2,8 +2,8 @@ r"""A known process with a learned belief: the densities are the true ones, and 
 
 .. math:: g_t = \mathrm{GRU}(g_{t-1}, [o_t, a_{t-1}]), \qquad q(s_{1:T} \mid o, a) = \prod_t q(s_t \mid g_t)
 
-Nothing but observations and actions feeds the recurrence, so q(s_t | g_t) is the belief itself, with a density, and
-can be held against the exact p(s_t | o_1:t). The state of a learned state-space model is its own and cannot.
+Only observations and actions feed the recurrence. So q(s_t | g_t) is the belief itself, has a density, and can be
+compared with the exact p(s_t | o_1:t). The state of a learned state-space model has no such counterpart.
 """
 
 from typing import Protocol
@@ -19,7 +19,7 @@ __all__ = ["Densities", "KnownModel", "LearnedBelief", "Standardizer"]
 
 
 class Densities(Protocol):
-    """What the bound asks of a process: three densities, in nats, differentiable in the state."""
+    """The densities of a process that the bound needs, in nats, differentiable in the state."""
 
     def log_initial(self, state: Tensor) -> Tensor:
         """Return log p(s_1): `(*, D)` to `(*)`."""
@@ -32,9 +32,9 @@ class Densities(Protocol):
 
 
 class Standardizer(nn.Module):
-    r"""Units in which a vector has mean 0 and variance 1: :math:`z = (x - \mu) / \sigma`, fixed, from examples.
+    r"""Standardise a vector to mean 0 and variance 1, :math:`z = (x - \mu) / \sigma`, with constants from examples.
 
-    Networks and the smallest standard deviations of belief families presume a scale of about 1; some processes have 10.
+    Networks and the smallest standard deviations of belief families assume a scale of about 1; some processes have 10.
 
     Args:
         examples: `(N, D)`, N at least 2, none of the D constant.
@@ -61,26 +61,26 @@ class Standardizer(nn.Module):
 
 
 class LearnedBelief:
-    r"""q(s_t | g_t) of every sequence and step, in the units of the process: :math:`s = \mu + \sigma z`.
+    r"""The belief q(s_t | g_t) at every step of every sequence, in units of the process, :math:`s = \mu + \sigma z`.
 
     .. math:: \log q(s_t \mid g_t) = \log q_z(z_t \mid c_t) - \textstyle\sum_d \log \sigma_d
 
     Args:
-        head: :math:`q_z`, a belief family.
+        head: :math:`q_z`, the head of a belief family.
         context: :math:`c_t`, a function of g_t, `(B, T, C)`.
-        units: :math:`\mu` and :math:`\sigma`.
+        units: has :math:`\mu` and :math:`\sigma`.
     """
 
     def __init__(self, head: BeliefHead, context: Tensor, units: Standardizer) -> None:
         self.head, self.context, self.units = head, context, units
 
     def rsample(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw s_t and log q(s_t) in nats, reparameterised: `(count, B, T, D)` and `(count, B, T)`."""
+        """Sample s_t, reparameterised, with log q(s_t) in nats: `(count, B, T, D)` and `(count, B, T)`."""
         z, log_prob = self.head.rsample(self.context, (count,))
         return self.units.inverse(z), log_prob - self.units.log_det()
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw s_t, `(count, B, T, D)`: a pure function of the generator's state."""
+        """Sample s_t, `(count, B, T, D)`, as a pure function of the generator's state."""
         seed = torch.randint(2**62, (), generator=generator)
         with torch.random.fork_rng([]), torch.no_grad():
             torch.manual_seed(int(seed))
@@ -92,16 +92,16 @@ class LearnedBelief:
 
 
 class KnownModel(nn.Module):
-    """The belief of a known process: a recurrent network that reads, and a head that says.
+    """The belief of a known process: a GRU over observations and actions, and the head of a belief family.
 
     Args:
-        process: its true densities.
+        process: the true densities.
         belief: builds the head from (state_dim, context_dim).
-        of_state: units of s_t.
-        of_input: units of [o_t, a_{t-1}].
-        hidden_dim: H of g.
-        mlp_dim: width of the perceptron between g and the head, and C of the head's context.
-        mlp_layers: layers of it.
+        of_state: standardises s_t.
+        of_input: standardises [o_t, a_{t-1}].
+        hidden_dim: dimensions of g, H.
+        mlp_dim: width of the MLP between g and the head, and of the head's context, C.
+        mlp_layers: layers of this MLP.
     """
 
     def __init__(
@@ -121,12 +121,12 @@ class KnownModel(nn.Module):
         self.head: BeliefHead = belief(len(of_state.mean), mlp_dim)
 
     def belief(self, observation: Tensor, action: Tensor) -> LearnedBelief:
-        """Read o_t, `(B, T, O)`, and a_{t-1}, `(B, T, A)`, and give the belief after each step; nothing looks ahead."""
+        """Return the belief after each step, given o_1, …, o_t, `(B, T, O)`, and a_1, …, a_{t-1}, `(B, T, A)`."""
         hidden, _ = self.gru(self.of_input(torch.cat((observation, action), -1)))  # (B, T, H)
         return LearnedBelief(self.head, self.context(hidden), self.of_state)
 
     def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
-        r"""Estimate the bound on log p(o_1:T | a_1:T-1) with one path per sequence; arguments as in `SequenceBatch`.
+        r"""Estimate the bound on log p(o_1:T | a_1:T-1) with one sample per sequence; arguments as in `SequenceBatch`.
 
         .. math:: J = E_q \sum_t \log p(o_t \mid s_t) - \left(\log q(s_t \mid g_t)
                   - \log p(s_t \mid s_{t-1}, a_{t-1})\right)

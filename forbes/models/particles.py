@@ -20,13 +20,10 @@ from typing import Literal, NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from forbes.beliefs import BeliefFamily
-from forbes.errors import ForbesError
-from forbes.models.base import EncodedSequence, Prediction, State
+from forbes.errors import ForbesError, require_at_least
+from forbes.models.base import EncodedSequence, FrameLogProb, ModelParts, State
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import Decoder, Encoder
-from forbes.models.state_space import StateSpaceModel
+from forbes.models.state_space import Filtered, StateSpaceModel
 from forbes.performance.precision import full_precision
 from forbes.shapes import printed_by_shape
 
@@ -56,6 +53,8 @@ class Particles(NamedTuple):
     """log p(o_t | h_t, s_t) in nats, `(K, B)`."""
     increment: Tensor
     """What the step adds to the bound, log p̂_t in nats, `(B,)`."""
+    filtered: Filtered
+    """The same particles with context and density, `(K B, ...)`."""
 
 
 def effective_sample_size(log_weight: Tensor) -> Tensor:
@@ -138,7 +137,7 @@ def run_particles(
         increment = joint.logsumexp(0)  # (B,)
         log_weight = joint - increment
         hidden, state = (values.view(*stay.shape, -1) for values in (moved.hidden, moved.state))  # (K, B, ...)
-        yield Particles(hidden, state, log_before, log_weight, reconstruction, increment)
+        yield Particles(hidden, state, log_before, log_weight, reconstruction, increment, moved)
         again = effective_sample_size(log_weight) < number / 2  # (B,)
         ancestor, log_child = resampling(log_weight)
         carried = _choose(hidden, state, torch.where(again, ancestor, stay))
@@ -159,38 +158,25 @@ class ParticleModel(StateSpaceModel):
     size is below K / 2, since each draw costs variance. The gradient leaves out the choice of ancestors, as there.
 
     Args:
-        belief: and all others up to `prior`, as for `StateSpaceModel`.
-        particles: K.
-        resampling: "systematic"; or "soft", which lets gradients pass through the weights of those drawn anew.
+        parts: see `StateSpaceModel`.
+        particles: number of particles, K.
+        resampling: "systematic"; or "soft", which lets gradients pass through the weights of the resampled particles.
 
     Example:
-        >>> model = forbes.ParticleModel(
-        ...     forbes.GaussianBelief, forbes.MLPEncoder((3,)), forbes.MLPDecoder(20, (3,)),
-        ...     forbes.VectorNormal(), action_dim=2, state_dim=4, hidden_dim=16, mlp_dim=16, mlp_layers=1, particles=4)
+        >>> parts = forbes.ModelParts(
+        ...     belief=forbes.GaussianBelief, encoder=forbes.MLPEncoder((3,)), decoder=forbes.MLPDecoder(20, (3,)),
+        ...     likelihood=forbes.VectorNormal(), action_dim=2, state_dim=4, hidden_dim=16, mlp_dim=16, mlp_layers=1)
+        >>> model = forbes.ParticleModel(parts, particles=4)
         >>> terms = model.lower_bound(torch.zeros(5, 10, 3), torch.zeros(5, 10, 2), torch.ones(5, 10, dtype=torch.bool))
         >>> terms.elbo.shape
         torch.Size([5])
     """
 
     def __init__(
-        self,
-        belief: BeliefFamily,
-        encoder: Encoder,
-        decoder: Decoder,
-        likelihood: Likelihood,
-        action_dim: int,
-        state_dim: int,
-        hidden_dim: int,
-        mlp_dim: int,
-        mlp_layers: int,
-        prior: BeliefFamily | None = None,
-        particles: int = 8,
-        resampling: Literal["systematic", "soft"] = "systematic",
+        self, parts: ModelParts, particles: int = 8, resampling: Literal["systematic", "soft"] = "systematic"
     ) -> None:
-        sizes = (action_dim, state_dim, hidden_dim, mlp_dim, mlp_layers)
-        super().__init__(belief, encoder, decoder, likelihood, *sizes, prior)
-        if particles < 1:
-            raise ForbesError(f"ParticleModel: particles is {particles}, expected at least 1")
+        super().__init__(parts)
+        require_at_least(1, "ParticleModel", particles=particles)
         self.particles = particles
         self.resampling: Resampling = {"systematic": systematic, "soft": soft}[resampling]
 
@@ -217,14 +203,18 @@ class ParticleModel(StateSpaceModel):
         uniform = torch.rand_like(last.log_weight[0])  # (B,)
         return _choose(last.hidden, last.state, systematic_resampling(last.log_weight, uniform, samples))
 
-    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
-        """See `BeliefModel.predict_one_step`: each particle draws s_t from the prior."""
-        features, log_weight = [], []
-        for step in self._run(encoded):
-            state, _ = self.prior.rsample(self.prior_context(step.hidden))  # (K, B, D)
-            features.append(torch.cat((step.hidden, state), -1))  # (K, B, H + D)
-            log_weight.append(step.log_before.log_softmax(0))
-        return Prediction(torch.stack(features, 2), torch.stack(log_weight, 2))  # (K, B, T, H + D), (K, B, T)
+    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
+        """See `BeliefModel.predictive_log_prob`: the weighted mean over one set of particles."""
+
+        def step_log_prob(step: Particles, target: Tensor) -> Tensor:
+            def score(features: Tensor) -> Tensor:
+                return log_likelihood(features.view(*step.log_before.shape, -1), target).flatten()  # (K B,)
+
+            each = self.one_step_log_prob(step.filtered, score(step.filtered.features), score)  # (K B,)
+            return (step.log_before.log_softmax(0) + each.view(step.log_before.shape)).logsumexp(0)  # (B,)
+
+        steps = zip(self._run(encoded), encoded.target.unbind(1), strict=True)
+        return torch.stack([step_log_prob(step, target) for step, target in steps], 1)  # (B, T)
 
     def num_belief_samples(self, number: int) -> int:
         """See `BeliefModel.num_belief_samples`: a draw is a whole set."""

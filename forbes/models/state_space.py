@@ -16,13 +16,13 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
 
-from forbes.beliefs import BeliefFamily, BeliefHead
-from forbes.errors import ForbesError
-from forbes.models.base import BeliefModel, EncodedSequence, Prediction, Rollout, State
+from forbes.beliefs import BeliefHead
+from forbes.errors import require_at_least
+from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import MLP, Decoder, Encoder
+from forbes.models.networks import MLP
 from forbes.performance.precision import full_precision
 from forbes.performance.recurrence import prepare_gru
 from forbes.performance.time_loop import TimeLoop
@@ -58,47 +58,26 @@ class StateSpaceModel(BeliefModel):
     """RSSM with any belief family: Gaussian gives PlaNet's and Dreamer's, flow gives FORBES.
 
     Args:
-        belief: builds the prior's and the posterior's head from (state_dim, context_dim).
-        encoder: o_t to e_t.
-        decoder: features to the likelihood's parameters; its input has `hidden_dim + state_dim` dimensions.
-        likelihood: what the decoder's output means.
-        action_dim: A, may be 0.
-        state_dim: D of s.
-        hidden_dim: H of h.
-        mlp_dim: width of every perceptron, and C of the belief's contexts.
-        mlp_layers: layers of every perceptron.
-        prior: builds the prior's instead, where it is of another family.
+        parts: what it is made of; `state_dim` is at least 1.
 
     Example:
-        >>> model = forbes.StateSpaceModel(
-        ...     forbes.GaussianBelief, forbes.MLPEncoder((3,)), forbes.MLPDecoder(20, (3,)),
-        ...     forbes.VectorNormal(), action_dim=2, state_dim=4, hidden_dim=16, mlp_dim=16, mlp_layers=1)
+        >>> model = forbes.StateSpaceModel(forbes.ModelParts(
+        ...     belief=forbes.GaussianBelief, encoder=forbes.MLPEncoder((3,)), decoder=forbes.MLPDecoder(20, (3,)),
+        ...     likelihood=forbes.VectorNormal(), action_dim=2, state_dim=4, hidden_dim=16, mlp_dim=16, mlp_layers=1))
         >>> terms = model.lower_bound(torch.zeros(5, 10, 3), torch.zeros(5, 10, 2), torch.ones(5, 10, dtype=torch.bool))
         >>> terms.elbo.shape
         torch.Size([5])
     """
 
-    def __init__(
-        self,
-        belief: BeliefFamily,
-        encoder: Encoder,
-        decoder: Decoder,
-        likelihood: Likelihood,
-        action_dim: int,
-        state_dim: int,
-        hidden_dim: int,
-        mlp_dim: int,
-        mlp_layers: int,
-        prior: BeliefFamily | None = None,
-    ) -> None:
-        if state_dim < 1:
-            raise ForbesError(f"{type(self).__name__}: state_dim is {state_dim}, expected at least 1")
-        super().__init__(encoder, decoder, likelihood, state_dim + action_dim, hidden_dim, mlp_dim, mlp_layers)
-        self.action_dim, self.state_dim = action_dim, state_dim
-        self.prior_context = MLP(hidden_dim, mlp_dim, mlp_layers)
-        self.posterior_context = MLP(hidden_dim + encoder.embedding_dim, mlp_dim, mlp_layers)
-        self.prior: BeliefHead = (prior or belief)(state_dim, mlp_dim)
-        self.posterior: BeliefHead = belief(state_dim, mlp_dim)
+    def __init__(self, parts: ModelParts) -> None:
+        require_at_least(1, type(self).__name__, state_dim=parts.state_dim)
+        super().__init__(parts, parts.state_dim + parts.action_dim)
+        self.action_dim, self.state_dim = parts.action_dim, parts.state_dim
+        embedding_dim, context_dim, layers = parts.encoder.embedding_dim, parts.mlp_dim, parts.mlp_layers
+        self.prior_context = MLP(parts.hidden_dim, context_dim, layers)
+        self.posterior_context = MLP(parts.hidden_dim + embedding_dim, context_dim, layers)
+        self.prior: BeliefHead = (parts.prior or parts.belief)(parts.state_dim, context_dim)
+        self.posterior: BeliefHead = parts.belief(parts.state_dim, context_dim)
 
     @property
     def bound_name(self) -> str:
@@ -200,16 +179,31 @@ class StateSpaceModel(BeliefModel):
         Returns:
             The T steps after `start`, without `start` itself.
         """
-        hidden, state = start
-        made: list[tuple[Tensor, Tensor, Tensor]] = []
-        with full_precision(state):
-            sample = self.prior.sampler(TimeLoop(steps, len(state)))
+        state, states, log_probs = start, [], []
+        with full_precision(start.state):
+            step = self.prepare_imagination(len(start.state), steps)
             for _ in range(steps):
-                action = policy(torch.cat((hidden, state), -1))
-                hidden = self.gru(self.transition(torch.cat((state, action), -1)), hidden)
-                state, log_prob = sample(self.prior_context(hidden))
-                made.append((hidden, state, log_prob))
-        return Rollout(*(torch.stack(values, 1) for values in zip(*made, strict=True)))  # (B, T, ...)
+                state, log_prob = step(state, policy(torch.cat(state, -1)))
+                states.append(state)
+                log_probs.append(log_prob)
+        hidden, drawn = (torch.stack(values, 1) for values in zip(*states, strict=True))  # (B, T, H), (B, T, D)
+        return Rollout(hidden, drawn, torch.stack(log_probs, 1))
+
+    def prepare_imagination(self, batch: int, steps: int) -> Callable[[State, Tensor], tuple[State, Tensor]]:
+        """Prepare the prior for a loop of T steps over B trajectories, within `full_precision`.
+
+        Returns:
+            One step: (h, s), `(B, …)`, and the action taken there, `(B, A)`, to the next (h, s) and its log p(s | h) in
+            nats, `(B,)`.
+        """
+        sample = self.prior.sampler(TimeLoop(steps, batch))
+
+        def step(before: State, action: Tensor) -> tuple[State, Tensor]:
+            hidden = self.gru(self.transition(torch.cat((before.state, action), -1)), before.hidden)  # (B, H)
+            state, log_prob = sample(self.prior_context(hidden))
+            return State(hidden, state), log_prob
+
+        return step
 
     def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
         """See `BeliefModel.sample_beliefs`: every sample has its own posterior trajectory, since h is random too."""
@@ -217,15 +211,47 @@ class StateSpaceModel(BeliefModel):
             -1
         )  # (N B, ...)
 
-    def predict(self, filtered: Filtered) -> Tensor:
-        """Return [h_t, s_t], `(B, T, H + D)`, with s_t drawn from the prior, which has not seen o_t."""
-        state, _ = self.prior.rsample(self.prior_context(filtered.hidden))  # (B, T, D)
-        return torch.cat((filtered.hidden, state), -1)  # (B, T, H + D)
+    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
+        """See `BeliefModel.predictive_log_prob`: along one posterior trajectory."""
+        filtered = self.filter(encoded.embedding, encoded.action)
 
-    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
-        """See `BeliefModel.predict_one_step`: along one posterior trajectory."""
-        features = self.predict(self.filter(encoded.embedding, encoded.action))
-        return Prediction(features[None], features.new_zeros(1, *features.shape[:2]))  # (1, B, T, H + D), (1, B, T)
+        def score(features: Tensor) -> Tensor:
+            return log_likelihood(features.flatten(0, 1), encoded.target.flatten(0, 1)).view(
+                features.shape[:2]
+            )  # (B, T)
+
+        return self.one_step_log_prob(filtered, score(filtered.features), score)
+
+    def one_step_log_prob(
+        self, filtered: Filtered, reconstruction: Tensor, log_likelihood: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        r"""Estimate log p(o_t | h_t), in nats, from a sample of the prior and the posterior's.
+
+        .. math:: \hat p(o_t \mid h_t) = \sum_{s \in \{\tilde s_t,\, s_t\}} p(o_t \mid h_t, s)\,
+                  \frac{p(s \mid h_t)}{p(s \mid h_t) + q(s \mid h_t, e_t)}, \qquad
+                  \tilde s_t \sim p(\cdot \mid h_t), \quad s_t \sim q(\cdot \mid h_t, e_t)
+
+        This is multiple importance sampling with the balance heuristic (Veach and Guibas, 1995): unbiased for every
+        posterior. The prior rarely finds an o_t that leaves few states possible. The posterior finds them, and no
+        weight can exceed 1, however narrow it is.
+
+        Args:
+            filtered: from `filter`, any leading shape `(*)`.
+            reconstruction: log p(o_t | h_t, s_t), `(*)`.
+            log_likelihood: log p(o_t | features) of features `(*, H + D)`, to `(*)`.
+
+        Returns:
+            `(*)`, in the dtype of `reconstruction`.
+        """
+        with full_precision(filtered.state):
+            context = self.prior_context(filtered.hidden)
+            sample, log_prior = self.prior.rsample(context)  # (*, D), (*)
+            log_posterior = self.posterior.log_prob(sample, filtered.context)
+            log_prior_at_posterior = self.prior.log_prob(filtered.state, context)
+        prediction = log_likelihood(torch.cat((filtered.hidden, sample), -1))
+        by_prior = prediction + _log_share(log_prior, log_posterior)
+        by_posterior = reconstruction + _log_share(log_prior_at_posterior, filtered.log_prob)
+        return torch.logaddexp(by_prior, by_posterior)
 
     def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """See `BeliefModel.lower_bound`: with one posterior trajectory per sequence."""
@@ -243,3 +269,8 @@ class StateSpaceModel(BeliefModel):
                 log_posterior = self.posterior.path_log_prob(filtered.state, filtered.context)  # (B, T)
             sampled = log_posterior - self.prior.log_prob(filtered.state, prior_context)  # (B, T)
         return ElboTerms(reconstruction, sampled, analytic, mask)
+
+
+def _log_share(log_p: Tensor, log_q: Tensor) -> Tensor:
+    """Return log p / (p + q)."""
+    return -softplus(log_q - log_p)

@@ -5,9 +5,9 @@ r"""A belief without a distribution: h_t itself, which predicts the next observa
     h_t = \mathrm{GRU}(h_{t-1}, \mathrm{MLP}(e_{t-1}, a_{t-1})), \quad (h_0, e_0) = (0, \bar e), \qquad
     \log p(o_{1:T}) = \sum_t \log p(o_t \mid h_t)
 
-Nothing is drawn, so the likelihood is exact, by the chain rule, and no bound is needed. Rolled on without observations,
-the learned embedding :math:`\bar e` of "nothing seen" stands for those that are missing: the simulator of Gregor et
-al., 2019, arXiv 1906.09237. One-step predictions alone would never train it, so it is trained by overshooting.
+Nothing is sampled, so the likelihood is exact, by the chain rule, and no bound is needed. In imagination, the learned
+embedding :math:`\bar e` of "nothing seen" replaces missing observations: the simulator of Gregor et al., 2019,
+arXiv 1906.09237. One-step predictions alone would never train it, so it is trained by overshooting.
 """
 
 from typing import ClassVar
@@ -15,12 +15,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from forbes.beliefs import BeliefFamily
-from forbes.errors import ForbesError
-from forbes.models.base import BeliefModel, EncodedSequence, Prediction, Rollout, State
+from forbes.errors import ForbesError, require_at_least
+from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.likelihoods import Likelihood
-from forbes.models.networks import Decoder, Encoder
 from forbes.performance.precision import full_precision
 from forbes.performance.recurrence import prepare_gru
 from forbes.performance.time_loop import TimeLoop
@@ -32,54 +29,32 @@ class VectorModel(BeliefModel):
     """A deterministic recurrent model; the pair it carries is (h_t, e_t), what it believed and what it then saw.
 
     Args:
-        belief: not used, nor is `prior`: it has no density of a state.
-        encoder: o_t to e_t.
-        decoder: h to the likelihood's parameters; its input has `hidden_dim` dimensions.
-        likelihood: what the decoder's output means.
-        action_dim: A.
-        state_dim: 0, since it has no stochastic state.
-        hidden_dim: H of h.
-        mlp_dim: width of the perceptron before the GRU.
-        mlp_layers: layers of it.
-        prior: see `belief`.
-        overshoot: steps that are rolled on from one random step of each sequence in training.
+        parts: what it is made of; `state_dim` is 0, since it has no stochastic state, and the belief is not used. The
+            decoder's input has `hidden_dim` dimensions.
+        overshoot: steps that are imagined from one random step of each sequence in training.
 
     Raises:
-        ForbesError: where `state_dim` is not 0, or `overshoot` below 1.
+        ForbesError: when `state_dim` is not 0, or `overshoot` below 1.
 
     Example:
-        >>> model = forbes.VectorModel(
-        ...     forbes.GaussianBelief, forbes.MLPEncoder((3,)), forbes.MLPDecoder(16, (3,)),
-        ...     forbes.VectorNormal(), action_dim=2, state_dim=0, hidden_dim=16, mlp_dim=16, mlp_layers=1)
+        >>> parts = forbes.ModelParts(
+        ...     belief=forbes.GaussianBelief, encoder=forbes.MLPEncoder((3,)), decoder=forbes.MLPDecoder(16, (3,)),
+        ...     likelihood=forbes.VectorNormal(), action_dim=2, state_dim=0, hidden_dim=16, mlp_dim=16, mlp_layers=1)
+        >>> model = forbes.VectorModel(parts)
         >>> terms = model.lower_bound(torch.zeros(5, 10, 3), torch.zeros(5, 10, 2), torch.ones(5, 10, dtype=torch.bool))
         >>> terms.elbo.shape
         torch.Size([5])
     """
 
-    parts: ClassVar[tuple[str, ...]] = ("overshoot",)
+    logged_terms: ClassVar[tuple[str, ...]] = ("overshoot",)
 
-    def __init__(
-        self,
-        belief: BeliefFamily,
-        encoder: Encoder,
-        decoder: Decoder,
-        likelihood: Likelihood,
-        action_dim: int,
-        state_dim: int,
-        hidden_dim: int,
-        mlp_dim: int,
-        mlp_layers: int,
-        prior: BeliefFamily | None = None,
-        overshoot: int = 15,
-    ) -> None:
-        if state_dim != 0:
-            raise ForbesError(f"VectorModel: state_dim is {state_dim}, expected 0, it has no stochastic state")
-        if overshoot < 1:
-            raise ForbesError(f"VectorModel: overshoot is {overshoot}, expected at least 1")
-        input_dim = encoder.embedding_dim + action_dim
-        super().__init__(encoder, decoder, likelihood, input_dim, hidden_dim, mlp_dim, mlp_layers)
+    def __init__(self, parts: ModelParts, overshoot: int = 15) -> None:
+        if parts.state_dim != 0:
+            raise ForbesError(f"VectorModel: state_dim is {parts.state_dim}, expected 0, it has no stochastic state")
+        require_at_least(1, "VectorModel", overshoot=overshoot)
+        super().__init__(parts, parts.encoder.embedding_dim + parts.action_dim)
         self.overshoot = overshoot
-        self.nothing = nn.Parameter(torch.zeros(encoder.embedding_dim))
+        self.nothing = nn.Parameter(torch.zeros(parts.encoder.embedding_dim))
 
     @property
     def bound_name(self) -> str:
@@ -116,17 +91,17 @@ class VectorModel(BeliefModel):
         hidden = self.filter(encoded.embedding, encoded.action)
         return State(hidden[:, -1].repeat(samples, 1), encoded.embedding[:, -1].repeat(samples, 1))  # (N B, ...)
 
-    def predict_one_step(self, encoded: EncodedSequence) -> Prediction:
-        """See `BeliefModel.predict_one_step`."""
+    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
+        """See `BeliefModel.predictive_log_prob`: it is exact."""
         hidden = self.filter(encoded.embedding, encoded.action)
-        return Prediction(hidden[None], hidden.new_zeros(1, *hidden.shape[:2]))  # (1, B, T, H), (1, B, T)
+        return log_likelihood(hidden.flatten(0, 1), encoded.target.flatten(0, 1)).view(hidden.shape[:2])  # (B, T)
 
     def num_belief_samples(self, number: int) -> int:
         """See `BeliefModel.num_belief_samples`: one is as good as many."""
         return 1
 
     def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
-        """Return log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the roll-out beside them."""
+        """Return log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the overshooting."""
         encoded = self.encode(observation, action)
         hidden = self.filter(encoded.embedding, action)
         log_likelihood = self.log_likelihood(hidden, encoded.target)  # (B, T)

@@ -1,10 +1,11 @@
 """The densities a process is made of: each evaluates itself, in nats, and draws from a generator."""
 
-import math
 from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor
+
+from forbes.densities import log_normal
 
 __all__ = ["DiagonalGaussian", "Distribution", "PointMass", "draw_index", "draw_normal"]
 
@@ -35,8 +36,7 @@ class DiagonalGaussian(Distribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """See `Distribution.log_prob`; differentiable in the value and in both parameters."""
-        noise = (value - self.mean) / self.std
-        return (-0.5 * noise.square() - self.std.log() - 0.5 * math.log(2 * math.pi)).sum(-1)
+        return log_normal(value, self.mean, self.std).sum(-1)
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """See `Distribution.sample`; reparameterised."""

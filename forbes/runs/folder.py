@@ -15,9 +15,6 @@ from forbes.reading import is_number, read_yaml
 
 __all__ = ["RunFolder", "experiment_name", "read_config", "read_metrics"]
 
-_MOVED = {"forbes.training.callbacks": "forbes.callbacks"}
-"""Packages whose classes older runs name in full, and where they are now."""
-
 
 class RunFolder:
     """Where the files of a run are.
@@ -136,18 +133,13 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def _with_public_names(section: Any) -> Any:
-    """Return a part of a configuration with each class where it is now.
-
-    `forbes.training.WorldModel` becomes `forbes.WorldModel`, and a package that has moved has its new name.
-    """
+    """Return a part of a configuration with `forbes.WorldModel` in the place of `forbes.training.WorldModel`."""
     if isinstance(section, list):
         return [_with_public_names(value) for value in section]
     if isinstance(section, dict):
         return {key: _with_public_names(value) for key, value in section.items()}
     module, _, name = section.rpartition(".") if isinstance(section, str) else ("", "", "")
-    if module and forbes.MODULES.get(name) == module:
-        return f"forbes.{name}"
-    return f"{_MOVED[module]}.{name}" if module in _MOVED else section
+    return f"forbes.{name}" if module and forbes.MODULES.get(name) == module else section
 
 
 def read_metrics(run: Path | str) -> pd.DataFrame:

@@ -20,8 +20,8 @@ from forbes.runs.configuration import (
     experiment_parser,
     require_classes,
 )
-from forbes.runs.hyperparameters import build_arguments, plain_arguments
 from forbes.runs.folder import RunFolder, read_config
+from forbes.runs.hyperparameters import build_arguments, plain_arguments
 
 __all__ = ["LoadedRun", "build_run", "check_weights", "load_module", "open_module", "weights_of"]
 
@@ -66,9 +66,7 @@ def load_module(checkpoint: Path, kind: type[Module], arguments: Mapping[str, An
     return module
 
 
-def open_module(
-    run: Path | str, kind: type[Module], other: str, changes: Mapping[str, Any] = {}
-) -> LoadedRun[Module]:
+def open_module(run: Path | str, kind: type[Module], other: str, changes: Mapping[str, Any] = {}) -> LoadedRun[Module]:
     """Load the module of a run, on the CPU and in evaluation mode.
 
     Args:

@@ -1,8 +1,8 @@
-"""What agents have in common: a world model that knows rewards too, and a choice of actions."""
+"""What agents share: a world model that predicts rewards too, and a selection of actions."""
 
 import copy
-import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -13,11 +13,12 @@ from forbes.control.policy import ScalarHead
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.data.episodes.collection import episode_seed, play_whole
 from forbes.data.episodes.episode import Episode
+from forbes.densities import log_normal
 from forbes.envs import Environment
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.models import EncodedSequence, Filtered, StateSpaceModel
 from forbes.models.networks import activate
-from forbes.training.world_model import Objective, WorldModel, require_at_least
+from forbes.training.world_model import LossTerm, WorldModel
 
 __all__ = ["AgentPolicy", "WorldModelAgent", "play_measured"]
 
@@ -28,18 +29,19 @@ class WorldModelAgent(WorldModel, ABC):
     .. math:: L_{model} = -J_{Model} - \overline{\log p(r_t \mid f_t)}
 
     Args:
-        control_dim: width of the reward's perceptron, and of what else acts.
-        reward_layers: hidden layers of the reward's.
-        reward_std: :math:`\sigma_r`; below 1, the belief is to know the reward better. PlaNet's scale of 10 is 0.32.
-        exploration: standard deviation of the noise on the actions of collected episodes; where actions are discrete,
-            how often one of them is any.
-        discrete: an action is one of A, one-hot; the command line takes it from the data.
-        acting_samples: K, trajectories of its belief whose mean action it takes (`Agent`), 1 in the paper; more can be
-            asked for after a training too.
+        control_dim: width of the MLPs of reward, actor and critic.
+        reward_layers: hidden layers of the reward's MLP.
+        reward_std: :math:`\sigma_r`; values below 1 weight the reward more. PlaNet's scale of 10 is 0.32.
+        exploration: standard deviation of the noise on the actions of collected episodes; for discrete actions the
+            probability of a uniformly random one.
+        discrete: whether an action is one of A, one-hot; the command line takes it from the data.
+        acting_samples: trajectories of the belief whose mean action the agent takes, K (see `Agent`); 1 in the paper.
+            It can be changed after a training.
         **world: arguments of `WorldModel`.
 
     Raises:
-        ForbesError: when a size is below 1, the noise below 0, `reward_std` not above it, or the data have no actions.
+        ForbesError: when a size is below 1, `exploration` below 0, `reward_std` not above 0, or the data have no
+            actions.
     """
 
     def __init__(
@@ -74,41 +76,38 @@ class WorldModelAgent(WorldModel, ABC):
 
     @classmethod
     def for_data(cls, data: SequenceDataModule, **options: Any) -> Self:
-        """See `WorldModel.for_data`; the data say whether actions are discrete, too."""
+        """See `WorldModel.for_data`. Whether actions are discrete is also taken from the data."""
         return super().for_data(data, **({"discrete": data.discrete} | options))
 
     @property
     def predicts_termination(self) -> bool:
-        """Whether it learns where episodes end by themselves."""
+        """Whether it learns where episodes terminate (a time limit is no termination)."""
         return False
 
     @abstractmethod
     def action_selector(self, exploring: bool) -> ActionSelector:
-        """Return how to act: with exploration, to learn from it, or as well as the agent can."""
+        """Return how to act: with exploration, to collect data, or greedily, to be evaluated."""
 
-    def objectives(self, batch: SequenceBatch) -> list[Objective]:
-        """See `WorldModel.objectives`: that of the world model."""
+    def loss_terms(self, batch: SequenceBatch) -> list[Callable[[], LossTerm]]:
+        """See `WorldModel.loss_terms`: that of the world model."""
         encoded, filtered = self.follow(batch)
-        return [lambda: self.model_objective(filtered, encoded, batch)]
+        return [lambda: self.model_loss(filtered, encoded, batch)]
 
     def follow(self, batch: SequenceBatch) -> tuple[EncodedSequence, Filtered]:
         """Encode a batch, and draw a trajectory of the posterior along it."""
         encoded = self.model.encode(batch.observation, batch.action)
         return encoded, self.model.filter(encoded.embedding, encoded.action)
 
-    def model_objective(
-        self, filtered: Filtered, encoded: EncodedSequence, batch: SequenceBatch
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of model and reward in nats per step, and what is logged of it, along a trajectory."""
+    def model_loss(self, filtered: Filtered, encoded: EncodedSequence, batch: SequenceBatch) -> LossTerm:
+        """Return the loss of model and reward along a trajectory, in nats per step."""
         terms = self.model.bound(filtered, encoded, batch.mask, self.kl)
         means = {name: terms.mean_over_steps(values) for name, values in self.log_probs(filtered, batch).items()}
         loss = self.loss(terms) - sum(means.values())
-        return loss, self.measures(terms) | {name: mean.detach() for name, mean in means.items()}
+        return LossTerm(loss, self.measures(terms) | {name: mean.detach() for name, mean in means.items()})
 
     def log_probs(self, filtered: Filtered, batch: SequenceBatch) -> dict[str, Tensor]:
-        """Return what the model learns besides observations, by name: log p(r_t | f_t) in nats, `(B, T)`."""
-        error: Tensor = (self.reward(filtered.features) - batch.reward) / self.reward_std  # (B, T)
-        return {"reward": -0.5 * error.square() - math.log(self.reward_std * math.sqrt(2 * math.pi))}
+        """Return what the model predicts in addition to observations, by name: log p(r_t | f_t) in nats, `(B, T)`."""
+        return {"reward": log_normal(batch.reward, self.reward(filtered.features), self.reward_std)}
 
 
 @dataclass(frozen=True)
@@ -120,8 +119,10 @@ class AgentPolicy:
 
     @classmethod
     def as_it_is(cls, agent: WorldModelAgent, exploring: bool) -> Self:
-        """Take a copy, on the CPU, that does not learn any further."""
-        return cls(copy.deepcopy(agent).cpu().eval(), exploring)
+        """Copy an agent to the CPU, in eval mode, and without its `recorded` update, which belongs to one process."""
+        shallow = copy.copy(agent)
+        shallow.recorded = None
+        return cls(copy.deepcopy(shallow).cpu().eval(), exploring)
 
     def __call__(self, environment: Environment, seed: int) -> Agent:
         """See `MakePolicy`."""
@@ -129,16 +130,16 @@ class AgentPolicy:
 
 
 def play_measured(agent: WorldModelAgent, environment: Environment, purpose: str, seed: int, number: int) -> Episode:
-    """Play an episode without exploration; it is a function of purpose, seed, number and the weights.
+    """Play an episode without exploration. It is a function of purpose, seed, number and the weights.
 
     Args:
-        agent: in eval mode.
-        environment: that it acts in.
-        purpose: keeps these episodes apart from all others of the same seed.
-        seed: of the measurement.
-        number: of the episode.
+        agent: the agent, in eval mode.
+        environment: the environment it acts in.
+        purpose: name mixed into the seed, so that these episodes differ from all others of the same seed.
+        seed: random seed of the measurement.
+        number: number of the episode.
 
     Raises:
-        ForbesError: where it breaks three times.
+        ForbesError: when the environment fails three times.
     """
     return play_whole(environment, AgentPolicy(agent, exploring=False), episode_seed(seed, number, purpose), number)

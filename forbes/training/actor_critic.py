@@ -1,22 +1,22 @@
 """FORBES and Dreamer as a LightningModule: a world model, and an actor and a critic that learn in its imagination."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from forbes.control.actor_critic import ImaginedWorld, actor_critic_losses
 from forbes.control.agent import ActionSelector, explore, greedy
-from forbes.control.imagination import belief_samples
-from forbes.control.policy import Actor, Policy, ScalarHead
-from forbes.control.returns import actor_loss, critic_loss, lambda_returns
+from forbes.control.policy import Actor, ScalarHead
 from forbes.data import SequenceBatch
-from forbes.errors import ForbesError
-from forbes.frozen import frozen
-from forbes.models import Filtered, State
+from forbes.errors import ForbesError, require_at_least
+from forbes.models import Filtered
 from forbes.models.networks import activate
 from forbes.training.acting import WorldModelAgent
-from forbes.training.world_model import Group, Objective, require_at_least
+from forbes.training.seeded import Group
+from forbes.training.world_model import LossTerm
 
 __all__ = ["ImaginationActorCritic"]
 
@@ -24,7 +24,8 @@ __all__ = ["ImaginationActorCritic"]
 class ImaginationActorCritic(WorldModelAgent):
     r"""Learns to act on beliefs (paper §3.2, algorithm 1). Dreamer is the same with `GaussianBelief` and N = 1.
 
-    Three losses, taken at the same parameters and minimised in one step; each trains its own networks only:
+    An update minimises three losses in one step; each trains its own networks only
+    (`control/actor_critic.py` has the algorithm):
 
     .. math::
 
@@ -32,33 +33,33 @@ class ImaginationActorCritic(WorldModelAgent):
         L_{actor} = -\overline{w_\tau (V_\tau - \eta \log \pi(a_{\tau-1}))}, \qquad
         L_{critic} = \overline{w_\tau \tfrac12 (v(f_\tau) - \mathrm{sg}(V_\tau))^2}
 
-    with the features :math:`f = [h, s]`, and λ-returns V along H imagined steps from N samples of the belief at every
-    step of every sequence, and :math:`w_\tau = \gamma^{\tau-1}`. Where the paper sums over N, the bar is a mean; Adam
-    does not see the factor. An actor of discrete actions has a categorical policy, and learns by straight-through
+    with the features :math:`f = [h, s]`, the λ-returns V along H imagined steps from N samples of the belief at every
+    step of every sequence, and :math:`w_\tau = \gamma^{\tau-1}`. The bar is a mean also over N, where the paper has a
+    sum; Adam does not depend on this factor. For discrete actions the policy is categorical, with straight-through
     gradients.
 
-    With `continuation`, :math:`L_{model}` has the term :math:`-\overline{\log p(c_t \mid f_t)}` too, where
-    :math:`c_t` is 0 if the episode ended in step t by itself, else 1. A discount is then
-    :math:`\gamma_\tau = \gamma\,p(c_\tau = 1 \mid f_\tau)`, the weights are :math:`w_\tau = \prod_{k<\tau} \gamma_k`,
-    and what is imagined from where an episode has ended does not count (Dreamer's `pcont`, off in its published runs
-    and in the paper).
+    With `continuation`, :math:`L_{model}` has the additional term :math:`-\overline{\log p(c_t \mid f_t)}`, where
+    :math:`c_t` is 0 if the episode terminated in step t, else 1. The discounts are then
+    :math:`\gamma_\tau = \gamma\,p(c_\tau = 1 \mid f_\tau)`, the weights :math:`w_\tau = \prod_{k<\tau} \gamma_k`,
+    and trajectories that start where an episode has terminated do not count (Dreamer's `pcont`, off in its published
+    runs and in the paper).
 
     Args:
-        trajectories: N.
-        horizon: H, at least 2.
-        discount: :math:`\gamma`.
+        trajectories: imagined trajectories per belief, N.
+        horizon: imagined steps, H, at least 2.
+        discount: discount factor :math:`\gamma`.
         lambda_: :math:`\lambda` of the returns.
         control_dim: width of actor, critic and reward.
-        actor_entropy: :math:`\eta`, the reward of a nat (DreamerV2, arXiv 2010.02193), 0 in paper and Dreamer. With
-            it, an actor that a model still wrong has driven to the border of the actions can come back.
-        actor_min_std: :math:`\sigma_{min}` of the actor before its tanh. At Dreamer's 1e-4 an actor that sees no use in
-            straying ends up deterministic, and learns from what it already does; DreamerV2's is 0.1.
-        continuation: learn where episodes end; needed where they end by themselves, not by a time limit.
+        actor_entropy: :math:`\eta`, the reward of a nat of entropy (DreamerV2, arXiv 2010.02193), 0 in paper and
+            Dreamer. It lets an actor return from the border of the action space, where an early model may drive it.
+        actor_min_std: :math:`\sigma_{min}` of the actor before its tanh. At Dreamer's 1e-4 an actor may become
+            deterministic and stop exploring; DreamerV2's is 0.1.
+        continuation: learn where episodes terminate; needed where they do so other than by a time limit.
         actor_layers: hidden layers of the actor.
         critic_layers: hidden layers of the critic.
         actor_rate: learning rate of the actor.
         critic_rate: learning rate of the critic.
-        **acting: arguments of `WorldModelAgent` and `WorldModel`; their learning rate is that of model and reward.
+        **acting: arguments of `WorldModelAgent` and `WorldModel`, whose learning rate is that of model and reward.
 
     Raises:
         ForbesError: when N or a size is below 1, H below 2, or the data have no actions.
@@ -109,15 +110,15 @@ class ImaginationActorCritic(WorldModelAgent):
         return self.continues is not None
 
     def action_selector(self, exploring: bool) -> ActionSelector:
-        """See `WorldModelAgent.action_selector`: a draw with noise, or the mode."""
+        """See `WorldModelAgent.action_selector`: a sample with noise, or the mode."""
         return explore(self.actor, self.exploration) if exploring else greedy(self.actor)
 
-    def objectives(self, batch: SequenceBatch) -> list[Objective]:
-        """See `WorldModel.objectives`: the model's, and actor's and critic's; their gradients do not overlap."""
+    def loss_terms(self, batch: SequenceBatch) -> list[Callable[[], LossTerm]]:
+        """See `WorldModel.loss_terms`: that of the model, and that of actor and critic."""
         encoded, filtered = self.follow(batch)
         return [
-            lambda: self.model_objective(filtered, encoded, batch),
-            lambda: self._control_objective(filtered, batch.mask & ~batch.ended),
+            lambda: self.model_loss(filtered, encoded, batch),
+            lambda: self.control_loss(filtered, batch.mask & ~batch.ended),
         ]
 
     def log_probs(self, filtered: Filtered, batch: SequenceBatch) -> dict[str, Tensor]:
@@ -128,54 +129,36 @@ class ImaginationActorCritic(WorldModelAgent):
             found["continuation"] = logsigmoid(sign * self.continues(filtered.features))  # (B, T)
         return found
 
-    def _control_objective(self, filtered: Filtered, begins: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        actor, critic = self.control_losses(filtered, begins)
-        return actor + critic, {"actor_loss": actor.detach(), "critic_loss": critic.detach()}
+    def control_loss(self, filtered: Filtered, start_mask: Tensor) -> LossTerm:
+        """Return the sum of the losses of actor and critic, and both of them to log."""
+        actor, critic = self.control_losses(filtered, start_mask)
+        return LossTerm(actor + critic, {"actor_loss": actor.detach(), "critic_loss": critic.detach()})
 
-    def control_losses(self, filtered: Filtered, begins: Tensor) -> tuple[Tensor, Tensor]:
-        """Imagine from beliefs, and give the losses of actor and critic, in units of reward and of its square.
+    def control_losses(self, filtered: Filtered, start_mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the losses of actor and critic along B sequences of T beliefs, see `actor_critic_losses`.
 
         Args:
-            filtered: B sequences of T beliefs.
-            begins: from which of them an imagined trajectory counts, bool `(B, T)`.
+            filtered: the beliefs, `(B, T, …)`.
+            start_mask: which of them an imagined trajectory starts from, bool `(B, T)`.
         """
-        samples = belief_samples(self.model, filtered, self.trajectories)
-        start = State(*(values.flatten(0, 2) for values in samples))  # (N B T, …)
-        valid = begins.expand(self.trajectories, -1, -1).flatten()  # (N B T,)
-        surprises: list[Tensor] = []
-
-        def act(features: Tensor) -> Tensor:
-            policy: Policy = self.actor(features.detach())
-            action, log_prob = policy.rsample()
-            surprises.append(-log_prob)
-            return action
-
-        with frozen(*self._world(), self.critic):
-            features = self.model.rollout(start, act, self.horizon).features  # (N B T, H, F)
-            discount = self._discount(features)
-            returns = lambda_returns(self.reward(features), self.critic(features), discount, self.lambda_)
-        value = self.critic(features[:, :-1].detach())  # (N B T, H - 1)
-        critic = critic_loss(value, returns, discount, valid)
-        if self.actor_entropy:  # else its gradient, of nothing, would cost 3 % of the imagination
-            entropy = torch.stack(surprises[:-1], -1)  # (N B T, H - 1), of the action that led to each of these states
-            returns = returns + self.actor_entropy * entropy
-        return actor_loss(returns, discount, valid), critic
-
-    def _world(self) -> list[nn.Module]:
-        """Return what the model's loss trains."""
-        return [part for part in (self.model, self.reward, self.continues) if part is not None]
-
-    def _discount(self, features: Tensor) -> Tensor:
-        """Return the discounts of imagined trajectories, `(*, H, F)` to `(*, H)` or, all alike, `(H,)`."""
-        if self.continues is None:
-            return features.new_full(features.shape[-2:-1], self.discount)  # (H,)
-        goes_on: Tensor = self.continues(features).sigmoid()  # (*, H)
-        return self.discount * goes_on
+        return actor_critic_losses(
+            ImaginedWorld(self.model, self.reward, self.continues),
+            self.actor,
+            self.critic,
+            filtered,
+            start_mask,
+            trajectories=self.trajectories,
+            horizon=self.horizon,
+            discount=self.discount,
+            lambda_=self.lambda_,
+            actor_entropy=self.actor_entropy,
+        )
 
     def groups(self) -> list[Group]:
-        """See `WorldModel.groups`: three, so that no gradient is scaled down for another's sake."""
+        """See `SeededModule.groups`: three, so that clipping one gradient does not shrink the others."""
+        world = filter(None, (self.model, self.reward, self.continues))
         return [
-            Group("model", [p for part in self._world() for p in part.parameters()], self.learning_rate),
+            Group("model", [p for part in world for p in part.parameters()], self.learning_rate),
             Group("actor", [*self.actor.parameters()], self.actor_rate),
             Group("critic", [*self.critic.parameters()], self.critic_rate),
         ]

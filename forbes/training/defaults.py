@@ -1,4 +1,4 @@
-"""What a world model needs for its data, where nobody says otherwise: the values of `configs/`."""
+"""Defaults of a world model by its data: the values of `configs/`."""
 
 from typing import Any
 
@@ -11,12 +11,12 @@ __all__ = ["defaults_for"]
 
 
 def defaults_for(source: SequenceSource) -> dict[str, Any]:
-    """Return arguments of `WorldModel` that fit a source; what is not among them keeps the default of the class.
+    """Return arguments of `WorldModel` that fit a source. All others keep the default of the class.
 
     Digit strokes have those of `configs/strokes/forbes.yaml` where a frame has at most one pixel, otherwise those of
     `configs/strokes/whole/forbes.yaml`. Known processes have those of `configs/pomdp`, with one-hot or normal
-    observations. Other vectors have perceptrons and a normal likelihood. Other images need nothing: the defaults of the
-    class are those of DeepMind Control.
+    observations. Other vectors have MLPs and a normal likelihood. Other images keep the defaults of the class, those of
+    DeepMind Control.
     """
     if isinstance(source, Strokes):
         return _one_pixel() if source.increments and source.points_per_step == 1 else _whole_frames()

@@ -16,7 +16,7 @@ class DivergedError(ForbesError):
 
     Args:
         message: one sentence.
-        update: that is not, counted from 1.
+        update: number of the first update that is not finite, counted from 1.
     """
 
     exit_status = 3
@@ -27,14 +27,14 @@ class DivergedError(ForbesError):
 
 
 def hold_unless_finite(optimizer: Optimizer, value: Tensor, update: int) -> None:
-    """Hold an optimiser from the first update on in which a value is not finite: its steps then change nothing.
+    """Let an optimiser change nothing from the first update on in which a value is not finite.
 
-    Nothing waits for the device. A fused optimiser reads `found_inf` there, as it does for a scaler of gradients.
+    A fused optimiser reads `found_inf` on the device, as it does for a gradient scaler. Nothing synchronises with it.
 
     Args:
-        optimizer: whose step comes next.
+        optimizer: the optimiser that is about to step.
         value: a loss or the norm of a gradient, a scalar.
-        update: number of the update at hand, from 0.
+        update: number of the current update, counted from 0.
     """
     state = vars(optimizer)
     held = torch.where(value.detach().isfinite(), math.inf, float(update))  # ()

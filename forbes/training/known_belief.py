@@ -1,13 +1,10 @@
 """A learned belief of a known process as a LightningModule: it optimises and logs, the mathematics is in the model."""
 
-import math
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-from lightning import LightningModule
 from torch import Tensor
-from torch.optim import Adam, Optimizer
-from torch.optim.lr_scheduler import LambdaLR
+from torch.optim import Optimizer
 
 from forbes.beliefs import BeliefFamily
 from forbes.data import SequenceBatch, SequenceDataModule, Simulated
@@ -18,19 +15,18 @@ from forbes.performance.precision import full_precision
 from forbes.pomdps import CategoricalBelief, Process
 from forbes.pomdps.base import require_positive
 from forbes.pomdps.distributions import PointMass
-from forbes.seeding import derive_seed, generator
-from forbes.training.divergence import hold_unless_finite
-from forbes.training.world_model import batches_before, follow_rates
+from forbes.seeding import generator
+from forbes.training.seeded import SeededModule
 
 __all__ = ["KnownBelief", "Objective", "has_transition_density"]
 
 Objective = Literal["state_nll", "elbo"]
 
 _EXAMPLES, _STEPS = 1000, 30
-"""Sequences, and their length, that the units of states and observations are taken from."""
+"""Number and length of the sequences that standardise states and observations."""
 
 
-class KnownBelief(LightningModule):
+class KnownBelief(SeededModule):
     r"""Learns q(s_t | o_1:t, a_1:t-1) of a process whose densities are known, so that its error can be measured.
 
     The objectives, in nats per step:
@@ -38,23 +34,23 @@ class KnownBelief(LightningModule):
     .. math:: L_{nll} = -\frac1T \sum_t \log q(s_t \mid o_{1:t}), \quad (s, o) \sim p, \qquad
               L_{elbo} = -\frac1T\, E_q\left[\log p(s, o) - \log q(s \mid o)\right]
 
-    The first is a proper score: its minimum is the exact belief, and what exceeds it is KL(exact ‖ q). The second is
-    what world models are trained by, and prefers a belief that is too narrow (`forbes theorem`).
+    The first is a proper score: it is minimal for the exact belief, and exceeds this minimum by KL(exact ‖ q). The
+    second trains world models, and prefers a belief that is too narrow (`forbes theorem`).
 
     Args:
-        process: e.g. `MirrorSensor`; the same as the data's.
+        process: the known process, e.g. `MirrorSensor`; the same as that of the data.
         belief: the family of q, a class of `forbes.beliefs` with its own arguments.
-        objective: "state_nll", which sees the states, or "elbo".
-        observation_shape: of one observation; the command line takes it from the data.
-        action_dim: A; likewise.
-        hidden_dim: H of the GRU that reads the observations.
-        mlp_dim: width of the perceptron between the GRU and the belief.
-        mlp_layers: layers of it.
-        learning_rate: of Adam at the start; it falls to 0 along a cosine.
-        seed: of the noise of training and validation.
+        objective: "state_nll", which uses the true states, or "elbo".
+        observation_shape: shape of one observation; the command line takes it from the data.
+        action_dim: dimensions of an action, A; the command line takes it from the data.
+        hidden_dim: dimensions of the GRU's state, H.
+        mlp_dim: width of the MLP between the GRU and the belief.
+        mlp_layers: layers of this MLP.
+        learning_rate: learning rate of Adam at the start. It falls to 0 along a cosine.
+        seed: random seed of the noise of training and validation.
 
     Raises:
-        ForbesError: where the data are not of the process, the process lacks a density that the objective needs, or a
+        ForbesError: when the data are of another process, the process lacks a density that the objective needs, or a
             size or the rate is not above 0.
 
     Example:
@@ -78,13 +74,13 @@ class KnownBelief(LightningModule):
         learning_rate: float = 3e-3,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(learning_rate, seed, schedule="cosine")
         sizes = {"hidden_dim": hidden_dim, "mlp_dim": mlp_dim, "mlp_layers": mlp_layers}
         require_positive("KnownBelief", **sizes, learning_rate=learning_rate)
         _require_density(process, objective)
         if (*observation_shape, action_dim) != (process.observation_dim, process.action_dim):
             raise _not_its_data(process, f"observations of shape {(*observation_shape,)} and {action_dim} actions")
-        self.process, self.objective, self.learning_rate, self.seed = process, objective, learning_rate, seed
+        self.process, self.objective = process, objective
         state, observation, action = process.sample(_EXAMPLES, _STEPS, generator(0, "units", 0))
         inputs = torch.cat((observation, action), -1)  # (N, T, O + A)
         units = Standardizer(state.flatten(0, 1)), Standardizer(inputs.flatten(0, 1))
@@ -92,7 +88,7 @@ class KnownBelief(LightningModule):
 
     @property
     def objective_name(self) -> str:
-        """Name the metric, without its split, that says how the training goes."""
+        """See `SeededModule.objective_name`."""
         return "loss"
 
     def setup(self, stage: str) -> None:
@@ -100,7 +96,7 @@ class KnownBelief(LightningModule):
         self.require_data(self.trainer.datamodule)  # type: ignore[attr-defined]
 
     def require_data(self, data: SequenceDataModule) -> None:
-        """Refuse data of another process; the same one draws the same sequences from the same noise."""
+        """Refuse data of another process. Equal processes sample equal sequences from the same noise."""
         source = data.source
         if not isinstance(source, Simulated):
             raise _not_its_data(self.process, f"those of {type(source).__name__}")
@@ -120,65 +116,35 @@ class KnownBelief(LightningModule):
         with full_precision(batch.state):
             return elbo_loss(self.model.elbo(batch.observation, batch.action, batch.mask))
 
-    def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
-        """Seed the noise of this batch, so that a resumed run draws the same."""
-        torch.manual_seed(derive_seed(self.seed, "update", batches_before(self)))
-
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Return and log the loss of one update."""
         loss = self.loss(batch)
-        self.log("train/loss", loss.detach(), batch_size=len(batch.mask))
+        self.log_split("train", {"loss": loss.detach()}, batch)
         return loss
 
-    def on_validation_epoch_start(self) -> None:
-        """Seed the noise of a validation, the same each time."""
-        torch.manual_seed(derive_seed(self.seed, "validation", 0))
-
-    def validation_step(self, batch: SequenceBatch, batch_idx: int) -> None:
-        """Log the loss of the validation split, and the proper score."""
-        self._log("val", batch)
-
-    def test_step(self, batch: SequenceBatch, batch_idx: int) -> None:
-        """Log the same of the test split; `forbes beliefs` says how far the belief is from the exact one."""
-        self._log("test", batch)
+    def measure(self, batch: SequenceBatch) -> dict[str, Tensor]:
+        """See `SeededModule.measure`: the loss, and the proper score."""
+        return {"loss": self.loss(batch), "state_nll": self.state_nll(batch).mean()}
 
     def predict_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Return -log q(s_t | o_1:t) of the true states in nats, `(B, T)`."""
         return self.state_nll(batch)
 
-    def configure_optimizers(self) -> Any:
-        """Adam, whose rate falls along half a cosine."""
-        optimizer = Adam(self.parameters(), lr=self.learning_rate, fused=True)
-        scheduler = LambdaLR(optimizer, self._rate)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
-
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Make no step where the gradient is not finite."""
         gradients = [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
-        hold_unless_finite(optimizer, torch.nn.utils.get_total_norm(gradients), self.global_step)
-
-    def on_train_start(self) -> None:
-        """See `WorldModel.on_train_start`."""
-        follow_rates(self, [self.learning_rate])
-
-    def _rate(self, update: int) -> float:
-        """Return the learning rate of an update as a share of `learning_rate`."""
-        return 0.5 * (1 + math.cos(math.pi * min(1.0, update / self.trainer.estimated_stepping_batches)))
-
-    def _log(self, split: str, batch: SequenceBatch) -> None:
-        values = {f"{split}/loss": self.loss(batch), f"{split}/state_nll": self.state_nll(batch).mean()}
-        self.log_dict(values, batch_size=len(batch.mask))
+        self.hold_unless_finite(optimizer, torch.nn.utils.get_total_norm(gradients))
 
 
 def has_transition_density(process: Process) -> bool:
-    """Tell whether p(s_t | s_{t-1}, a) is a density; of certain steps it is not."""
+    """Return whether p(s_t | s_{t-1}, a) is a density. It is none where the transition is deterministic."""
     zeros = torch.zeros(1, process.state_dim + process.action_dim)
     state, action = zeros.split((process.state_dim, process.action_dim), -1)  # (1, D), (1, A)
     return not isinstance(process.transition(state, action), PointMass)
 
 
 def _require_density(process: Process, objective: Objective) -> None:
-    """Refuse finite states, and the ELBO where there is no p(s_t | s_{t-1}, a) to put into it."""
+    """Refuse finite states, and the ELBO where p(s_t | s_{t-1}, a) is no density."""
     name = type(process).__name__
     if isinstance(process.initial(torch.zeros(1)), CategoricalBelief):
         raise ForbesError(f"KnownBelief: the states of {name} are finite, expected a density. Train a WorldModel on it")

@@ -1,4 +1,4 @@
-"""Load what a run has learned, without a Trainer."""
+"""Load the trained model of a run, without a Trainer."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,11 +19,11 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
     """Load a run's world model, on the CPU and in evaluation mode, and its data, without a Trainer.
 
     Args:
-        run: its folder, for the last checkpoint, or a checkpoint in it.
+        run: run folder, for its last checkpoint, or a checkpoint in it.
 
     Raises:
-        ForbesError: when the folder holds no trained run or one of another kind, or its configuration and its
-            checkpoint do not fit together.
+        ForbesError: when the folder holds no trained run or one of another kind, or when configuration and checkpoint
+            do not fit together.
 
     Example:
         >>> world, data = forbes.load_run("runs/forbes-0")  # forbes fit --run_dir runs/forbes-0 --config ...
@@ -35,12 +35,12 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
 
 
 def open_run(run: Path | str) -> LoadedRun[WorldModel]:
-    """Load a run as `load_run`, with what a record of its measurement must name."""
+    """Load a run as `load_run`, with the provenance that a record of its measurement names."""
     return open_module(run, WorldModel, "forbes beliefs")
 
 
 def load_known_belief(run: Path | str) -> LoadedRun[KnownBelief]:
-    """Load a run's belief of a known process, otherwise as `open_run`."""
+    """Load a run of `KnownBelief`, otherwise as `open_run`."""
     return open_module(run, KnownBelief, "forbes evaluate")
 
 
@@ -48,15 +48,15 @@ def load_known_belief(run: Path | str) -> LoadedRun[KnownBelief]:
 def loaded_agent(
     run: str, device: str, samples: int | None = None
 ) -> Iterator[tuple[WorldModelAgent, EnvironmentProcess, str]]:
-    """Load a run's agent on a device, with its environment, which is closed at the end, and its checkpoint's SHA-256.
+    """Load a run's agent on a device, with its environment, closed at the end, and the SHA-256 of its checkpoint.
 
     Args:
-        run: folder.
-        device: of the model.
-        samples: K, trajectories of its belief that it acts on; None for as many as it was trained with.
+        run: run folder.
+        device: device of the model.
+        samples: trajectories of the belief that the agent acts on, K; None for its `acting_samples`.
 
     Raises:
-        ForbesError: where the run is not an agent's.
+        ForbesError: when the run is not that of an agent.
     """
     module, data, _, checkpoint = open_run(run)
     if not isinstance(module, WorldModelAgent) or not isinstance(data.source, Experience):

@@ -1,28 +1,27 @@
-"""PlaNet as a LightningModule: a world model, whose agent searches for its next action anew at each step."""
+"""PlaNet as a LightningModule: a world model, and an agent that plans its next action at each step."""
 
 from typing import Any
 
 from forbes.control.agent import ActionSelector, follow_plan, noisy
 from forbes.control.planning import CrossEntropy
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.training.acting import WorldModelAgent
-from forbes.training.world_model import require_at_least
 
 __all__ = ["PlanningAgent"]
 
 
 class PlanningAgent(WorldModelAgent):
-    """Learns the world model only, and plans in it (Hafner et al., 2019, arXiv 1811.04551), on beliefs of any family.
+    """Learns a world model and plans in it, on beliefs of any family (PlaNet, Hafner et al., 2019, arXiv 1811.04551).
 
     Args:
-        horizon: steps of a plan.
-        iterations: of the search.
-        candidates: J.
-        best: M, of which the next proposal is made.
+        horizon: steps of a plan, H.
+        iterations: iterations of the search.
+        candidates: action sequences per iteration, J.
+        best: number of elites, M, from which the next proposal is computed.
         **acting: arguments of `WorldModelAgent` and `WorldModel`.
 
     Raises:
-        ForbesError: when a number is below 1, `best` above `candidates`, or actions are discrete.
+        ForbesError: when an argument is below 1, `best` above `candidates`, or actions are discrete.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Experience("mountain_hike"), length=30, batch_size=20)

@@ -1,4 +1,4 @@
-"""What of a world model's parts does not go together, as one sentence."""
+"""Refuse parts of a world model that do not fit together."""
 
 from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel
@@ -10,7 +10,7 @@ __all__ = ["require_mean", "require_path", "require_rank"]
 
 
 def require_path(kl: KL, model: BeliefModel) -> None:
-    """Raise a ForbesError for a path derivative where there is none."""
+    """Raise a ForbesError if the path derivative is asked of a model that has none."""
     if kl != "path":
         return
     if type(model) is not StateSpaceModel:
@@ -24,7 +24,7 @@ def require_path(kl: KL, model: BeliefModel) -> None:
 
 
 def require_rank(likelihood: Likelihood, observation_shape: tuple[int, ...]) -> None:
-    """Raise a ForbesError where a likelihood would sum over what is no dimension of an observation."""
+    """Raise a ForbesError if a likelihood would sum over dimensions that are not those of an observation."""
     if likelihood.rank != len(observation_shape):
         others = {1: "VectorNormal or OneHot", 3: "Normal or Bernoulli"}.get(len(observation_shape), "your own")
         raise ForbesError(
@@ -34,7 +34,7 @@ def require_rank(likelihood: Likelihood, observation_shape: tuple[int, ...]) -> 
 
 
 def require_mean(likelihood: Likelihood) -> None:
-    """Raise a ForbesError where a decoder's output is not the mean of the target, so cannot be one off a center."""
+    """Raise a ForbesError unless the decoder's output is the mean of the target, to which a center can be added."""
     if not isinstance(likelihood, Normal | VectorNormal):
         raise ForbesError(
             f"WorldModel: center with the likelihood {type(likelihood).__name__}, expected Normal or VectorNormal. "

@@ -1,6 +1,7 @@
 """A recorded update: elementwise functions that the compiler fuses, and, where there is a GPU, the playback."""
 
 import json
+import pickle
 from contextlib import contextmanager, nullcontext
 from functools import partial
 
@@ -19,6 +20,7 @@ from forbes.models import ConvDecoder, ConvEncoder
 from forbes.performance.fusion import fused, fusing
 from forbes.training import ImaginationActorCritic
 from forbes.training.acting import AgentPolicy
+from forbes.training.world_model import LossTerm
 
 BATCH, TIME = 3, 4
 # The compiler looks at gradients that are not there.
@@ -58,10 +60,10 @@ def make_batch(seed):
     return SequenceBatch(observation, action, reward, mask, torch.zeros(BATCH, TIME, 0), ~mask)
 
 
-def results(losses, agent, batch):
+def results(total_loss, agent, batch):
     """Give loss, what is logged, and all gradients, with the noise of one seed."""
     torch.manual_seed(1)
-    loss, values = losses(batch)
+    loss, values = total_loss(batch)
     return loss.detach().clone(), values, torch.autograd.grad(loss, list(agent.parameters()))
 
 
@@ -92,10 +94,10 @@ def test_fused_functions_are_compiled_and_their_numbers_and_gradients_are_the_sa
         return torch.compile(function, fullgraph=True, dynamic=False, backend="aot_eager")
 
     monkeypatch.setattr(forbes.performance.fusion, "_compiled", compile_without_code)
-    plain = results(agent.losses, agent, make_batch(0))
+    plain = results(agent.total_loss, agent, make_batch(0))
 
     with fusing():
-        fused_ones = results(agent.losses, agent, make_batch(0))
+        fused_ones = results(agent.total_loss, agent, make_batch(0))
 
     torch.testing.assert_close(fused_ones, plain)
     assert {"after_sum", "_squeeze", "lambda_returns"} <= set(compiled)
@@ -118,7 +120,7 @@ def test_a_loss_that_changes_by_itself_is_refused(tmp_path, capsys):
     config.write_text(config.read_text().replace(*WITH))
 
     assert fit("--config", config, "--model.kl_warmup", 10, "--run_dir", tmp_path / "run") == 2
-    assert "CudaGraph: kl_warmup weighs every update anew, expected 0" in capsys.readouterr().err
+    assert "CudaGraph: kl_warmup changes the loss between updates, expected 0" in capsys.readouterr().err
 
 
 def test_what_is_no_world_model_is_refused():
@@ -127,17 +129,30 @@ def test_what_is_no_world_model_is_refused():
 
 
 def test_an_agent_that_plays_in_another_process_leaves_the_recording_behind(agent):
-    vars(agent)["losses"] = lambda _: None
+    agent.recorded = lambda _: None
 
-    assert AgentPolicy.as_it_is(agent, exploring=True).agent.losses(make_batch(0))[0].isfinite()
+    copied = AgentPolicy.as_it_is(agent, exploring=True).agent
+
+    assert copied.recorded is None
+    assert agent.recorded is not None  # the one that learns keeps it
+    pickle.dumps(copied)
+
+
+def test_a_training_step_takes_the_recorded_loss(agent, monkeypatch):
+    logged = {}
+    monkeypatch.setattr(agent, "log_dict", lambda values, batch_size: logged.update(values))
+    agent.recorded = lambda batch: LossTerm(torch.tensor(float(len(batch.mask))), {"of": torch.tensor(7.0)})
+
+    assert agent.training_step(make_batch(0), 0) == BATCH
+    assert logged == {"train/of": 7}
 
 
 def test_after_a_fit_a_module_has_its_own_losses_again(agent):
-    vars(agent)["losses"] = lambda _: None
+    agent.recorded = lambda _: None
 
     CudaGraph().teardown(None, agent, "fit")
 
-    assert agent.losses(make_batch(0))[0].isfinite()
+    assert agent.recorded is None
 
 
 class NoStream:
@@ -176,14 +191,14 @@ def without_device(monkeypatch):
 def test_the_branches_of_a_recording_add_up_to_the_whole(agent):
     recorded = Recording(agent, make_batch(0), nullcontext)
 
-    torch.testing.assert_close(results(recorded, agent, make_batch(0)), results(agent.losses, agent, make_batch(0)))
+    torch.testing.assert_close(results(recorded, agent, make_batch(0)), results(agent.total_loss, agent, make_batch(0)))
 
 
 @pytest.mark.usefixtures("without_device")
 def test_a_scaled_loss_has_scaled_gradients(agent):
     recorded = Recording(agent, make_batch(0), nullcontext)
     _, _, once = results(recorded, agent, make_batch(0))
-    _, _, thrice = results(lambda batch: (3 * recorded(batch)[0], {}), agent, make_batch(0))
+    _, _, thrice = results(lambda batch: (3 * recorded(batch).loss, {}), agent, make_batch(0))
 
     torch.testing.assert_close(thrice, tuple(3 * gradient for gradient in once))
 
@@ -212,7 +227,7 @@ def test_a_recording_gives_the_losses_and_gradients_of_any_batch(agent, half):
 
     def plain(batch):
         with precision():
-            return agent.losses(batch)
+            return agent.total_loss(batch)
 
     recorded = Recording(agent, batches[0], precision)
     tolerance = {"rtol": 2e-2, "atol": 2e-2} if half else {"rtol": 1e-4, "atol": 1e-5}

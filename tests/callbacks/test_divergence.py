@@ -17,7 +17,7 @@ from forbes.runs.folder import RunFolder, read_config, read_metrics
 from forbes.seeding import derive_seed
 from forbes.training.divergence import hold_unless_finite
 from forbes.training.loading import load_run
-from forbes.training.world_model import WorldModel
+from forbes.training.world_model import LossTerm, WorldModel
 
 TOO_FAST = ["--model.learning_rate", "1e30"]
 
@@ -57,7 +57,7 @@ def test_the_update_can_be_computed_again(diverged):
     (batch,) = (SequenceBatch(**values) for values in failure["batches"])
 
     torch.manual_seed(derive_seed(failure["seed"], "update", failure["update"]))
-    loss, _ = module.losses(batch)
+    loss, _ = module.total_loss(batch)
     loss.backward()
 
     gradients = [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
@@ -117,16 +117,15 @@ def test_replay_says_so_where_the_update_is_finite_now(tiny_config, tmp_path, mo
 def test_replay_repeats_noise_batches_and_weight_of_the_kl(tiny_config, tmp_path, monkeypatch):
     """Of the second update of the second epoch: its sixth batch, of an epoch of two, two and one."""
     seen = []
-    losses = WorldModel.losses
+    total_loss = WorldModel.total_loss
 
     def remember(self, batch):
-        loss, values = losses(self, batch)
+        loss, values = total_loss(self, batch)
         seen.append((self.global_step, loss.item()))
-        return loss * (
-            torch.nan if self.global_step == 4 and self._trainer.fit_loop.total_batch_idx == 8 else 1
-        ), values
+        broken = self.global_step == 4 and self._trainer.fit_loop.total_batch_idx == 8
+        return LossTerm(loss * (torch.nan if broken else 1), values)
 
-    monkeypatch.setattr(WorldModel, "losses", remember)
+    monkeypatch.setattr(WorldModel, "total_loss", remember)
     run = RunFolder(tmp_path / "run")
     flags = ["--trainer.accumulate_grad_batches", "2", "--model.kl_warmup", "20", "--run_dir", str(run)]
     assert main(["fit", "--config", str(tiny_config), *flags]) == 3
@@ -271,7 +270,7 @@ def test_a_gradient_that_is_not_finite_stops_a_training_whose_loss_is(tiny_confi
 def test_parameters_that_are_not_finite_are_never_saved(tiny_run, tmp_path, monkeypatch, capsys):
     run = RunFolder(shutil.copytree(tiny_run, tmp_path / "run"))
     before = run.checkpoint.read_bytes()
-    monkeypatch.setattr("forbes.training.divergence.StopAtDivergence._stop_if_held", lambda *_: None)
+    monkeypatch.setattr("forbes.callbacks.divergence.StopAtDivergence._stop_if_held", lambda *_: None)
 
     def break_one(self, *_):
         next(self.parameters()).data.fill_(torch.nan)

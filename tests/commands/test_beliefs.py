@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_line import error_of
 
 from forbes.commands.cli import main
 from forbes.training.loading import load_known_belief
@@ -58,16 +59,6 @@ def beliefs(*arguments):
 
 def record(run):
     return json.loads((run / "evaluation.json").read_text())
-
-
-def error_of(capsys, *arguments):
-    """What a wrong call prints: one line after those of the progress, with exit code 2."""
-    capsys.readouterr()
-    assert main([str(argument) for argument in arguments]) == 2
-    *progress, line = capsys.readouterr().err.splitlines()
-    assert all(each.endswith(" sequences") for each in progress)
-    assert line.startswith("forbes: ")
-    return line
 
 
 def test_a_record_names_the_checkpoint_that_was_measured(run, overwritten):

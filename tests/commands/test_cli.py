@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from command_line import error_of
 from lightning_utilities.core.imports import RequirementCache
 
 from forbes import __version__
@@ -155,15 +156,6 @@ def test_misspelt_arguments_of_a_class_are_named(tiny_config, tmp_path, capsys):
     sentence = error_of(capsys, "fit", "--config", str(config))
 
     assert sentence == f"{config}: model.encoder: MLPEncoder: expected init_args beside class_path, found int_args"
-
-
-def error_of(capsys, *arguments):
-    """Run a command that must fail with one sentence and nothing else, and give the sentence."""
-    assert main(list(arguments)) == 2
-    output = capsys.readouterr().err
-    assert output.startswith("forbes: ")
-    assert output.count("\n") == 1
-    return output.removeprefix("forbes: ").strip()
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from command_line import error_of
 
 from forbes.commands.cli import main
 from forbes.data.strokes import classifiers
@@ -92,13 +93,6 @@ def test_the_same_command_gives_the_same_numbers(completed, runs, tmp_path, caps
     assert (tmp_path / "completions-c2.png").read_bytes() == (completed / "completions-c2.png").read_bytes()
 
 
-def error_of(capsys, *arguments):
-    capsys.readouterr()
-    assert main(["completions", *arguments]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
-
-
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
@@ -110,7 +104,9 @@ def error_of(capsys, *arguments):
     ],
 )
 def test_wrong_numbers_are_named(flags, sentence, runs, tmp_path, capsys):
-    assert sentence in error_of(capsys, *runs, *NUMBERS[:4], "--prefixes", "2", *flags, "-o", str(tmp_path))
+    assert sentence in error_of(
+        capsys, "completions", *runs, *NUMBERS[:4], "--prefixes", "2", *flags, "-o", str(tmp_path)
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -118,18 +114,18 @@ def test_runs_that_do_not_fit_are_named(runs, tiny_config, tmp_path, capsys):
     other = str(tmp_path / "other")
     points = ["--data.init_args.source.init_args.points_per_step", "2"]
     assert main(["fit", "--config", str(tiny_config), "--run_dir", other, *points]) == 0
-    assert "Compare runs of the same data" in error_of(capsys, runs[0], other, *NUMBERS)
+    assert "Compare runs of the same data" in error_of(capsys, "completions", runs[0], other, *NUMBERS)
 
     config = Path(__file__).parents[2] / "configs" / "pomdp" / "linear_gaussian" / "rssm.yaml"
     vectors = str(tmp_path / "vectors")
     small = ["--data.updates_per_epoch=1", "--trainer.max_epochs=1", "--trainer.log_every_n_steps=1"]
     assert main(["fit", "--config", str(config), *small, "--run_dir", vectors]) == 0
-    assert "expected Strokes. Name other runs" in error_of(capsys, vectors, *NUMBERS)
+    assert "expected Strokes. Name other runs" in error_of(capsys, "completions", vectors, *NUMBERS)
 
 
 def test_missing_classifiers_are_an_error(runs, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(classifiers, "classifiers_path", lambda: tmp_path / "classifiers.npz")
-    assert "classifiers.npz: there is no such file" in error_of(capsys, *runs, *NUMBERS)
+    assert "classifiers.npz: there is no such file" in error_of(capsys, "completions", *runs, *NUMBERS)
 
 
 def test_digits_are_drawn_from_the_most_to_the_least_ambiguous():

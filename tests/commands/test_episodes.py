@@ -6,21 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy_environments  # its classes are tasks by name, as those of --allow-module are
+from command_line import error_of
 from PIL import Image
 
 from forbes.commands.cli import main
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 
 DOCS = Path(__file__).parents[2] / "docs"
-
-
-def error_of(capsys, *arguments):
-    """Run a command that must fail with one sentence and nothing else, and give the sentence."""
-    assert main(["data", *map(str, arguments)]) == 2
-    output = capsys.readouterr().err
-    assert output.startswith("forbes: ")
-    assert output.count("\n") == 1
-    return output.removeprefix("forbes: ").strip()
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +67,7 @@ def test_a_store_of_another_limit_of_steps_is_another_store(tmp_path, capsys):
     collect = ["collect", "--task", "Parrot", "-o", tmp_path, "--episodes"]
     assert main(["data", *map(str, collect), "1"]) == 0
     sentence = "holds episodes whose time_limit is 100000, not 7. Choose another folder"
-    assert sentence in error_of(capsys, *collect, 2, "--time-limit", 7)
+    assert sentence in error_of(capsys, "data", *collect, 2, "--time-limit", 7)
 
     index = tmp_path / "index.jsonl"  # of a version that had no limit: one that nobody reached
     index.write_text(index.read_text().replace(', "time_limit": 100000', ""))
@@ -140,12 +132,12 @@ def damaged(tmp_path, capsys):
 
 
 def test_a_damaged_store_is_named_by_what_reads_it_and_what_is_put_aside_is_told(damaged, capsys):
-    assert re.search(r"000000\.npz: damaged .*forbes data check", error_of(capsys, "info", damaged))
+    assert re.search(r"000000\.npz: damaged .*forbes data check", error_of(capsys, "data", "info", damaged))
     assert main(["data", "check", str(damaged)]) == 1
     capsys.readouterr()
 
     for command in ("info", "check"):
-        assert error_of(capsys, command, damaged) == (
+        assert error_of(capsys, "data", command, damaged) == (
             f"{damaged}: there are no episodes but 1 in quarantine. Collect some: forbes data collect --task TASK "
             f"-o {damaged}"
         )
@@ -212,7 +204,7 @@ def test_vectors_are_described_and_not_drawn(tmp_path, capsys):
     ],
 )
 def test_what_cannot_be_is_one_sentence(arguments, sentence, in_tmp_path, capsys):
-    assert error_of(capsys, *arguments) == sentence
+    assert error_of(capsys, "data", *arguments) == sentence
     assert list(in_tmp_path.iterdir()) == []
 
 
@@ -220,12 +212,12 @@ def test_a_misspelt_task_of_the_suite_is_suggested_from_the_process_that_knows_i
     pytest.importorskip("dm_control")
     arguments = ["collect", "--task", "walker_wlak", "--no-pixels", "-o", tmp_path / "store"]
 
-    assert error_of(capsys, *arguments).startswith("walker_wlak: no such task. Did you mean walker_walk")
+    assert error_of(capsys, "data", *arguments).startswith("walker_wlak: no such task. Did you mean walker_walk")
 
 
 def test_a_store_that_is_written_to_is_left_alone(pictures, capsys):
     with EpisodeWriter(pictures):
-        assert "writes episodes here. Choose another folder" in error_of(capsys, "check", pictures)
+        assert "writes episodes here. Choose another folder" in error_of(capsys, "data", "check", pictures)
 
 
 def test_the_environment_of_the_documentation_can_be_collected(tmp_path, monkeypatch, capsys):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_line import error_of
 from small_models import make_model
 
 from forbes.commands import tables
@@ -111,13 +112,10 @@ def record_is_missing(run):
     return not (RunFolder(run).path / "evaluation.json").exists()
 
 
-def error_of(capsys, *arguments):
-    """What a wrong call prints: one line, with exit code 2."""
-    capsys.readouterr()
-    assert evaluate(*arguments) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("forbes: ")
-    return line
+def refusal(capsys, *arguments):
+    """What `forbes evaluate` says of these arguments, which it refuses."""
+    scores = [] if "--scores" in arguments else ["--scores", "elbo"]
+    return error_of(capsys, "evaluate", "--samples", "2", *arguments, *scores)
 
 
 def arrays_of(run):
@@ -220,8 +218,8 @@ def test_a_score_that_a_model_does_not_have_is_left_out_and_said(runs, other_fil
 def test_scores_and_numbers_that_cannot_be_are_said_in_one_sentence(other_filters, capsys):
     vector, particle = other_filters
     expected = "a Vector model has no elbo or fivo score, its likelihood is exact. Ask for --scores pll or open-loop"
-    assert expected in error_of(capsys, vector, "--scores", "elbo", "fivo")
-    message = error_of(capsys, particle, "--scores", "pll", "--particles", "3")
+    assert expected in refusal(capsys, vector, "--scores", "elbo", "fivo")
+    message = refusal(capsys, particle, "--scores", "pll", "--particles", "3")
     assert "3 particles or futures, expected whole sets of 2" in message
     assert evaluate(particle, "--scores", "fivo", "--particles", "3", "--digits", "2") == 0  # of any number
 
@@ -423,13 +421,13 @@ def test_its_help_shows_an_example(capsys):
 
 def test_runs_of_different_data_are_not_compared(runs, tiny_config, tmp_path, capsys):
     other = fit(tiny_config, tmp_path / "other", "--data.init_args.source.init_args.points_per_step", "2")
-    assert "points_per_step=2" in error_of(capsys, runs[0], str(other))
+    assert "points_per_step=2" in refusal(capsys, runs[0], str(other))
     assert record_is_missing(runs[0])
 
 
 def test_runs_of_different_likelihoods_are_not_compared(runs, tiny_config, tmp_path, capsys):
     other = fit(tiny_config, tmp_path / "other", "--model.init_args.likelihood", "Normal")
-    assert "its likelihood is normal(1)" in error_of(capsys, runs[0], str(other))
+    assert "its likelihood is normal(1)" in refusal(capsys, runs[0], str(other))
 
 
 def test_a_broken_model_fails_and_names_run_and_sequence(runs, capsys):
@@ -438,23 +436,23 @@ def test_a_broken_model_fails_and_names_run_and_sequence(runs, capsys):
     checkpoint["state_dict"]["model.gru.weight_hh"].fill_(torch.nan)
     torch.save(checkpoint, path)
 
-    assert f"{runs[0]}, test split: the elbo of sequence 0 is nan" in error_of(capsys, runs[0])
+    assert f"{runs[0]}, test split: the elbo of sequence 0 is nan" in refusal(capsys, runs[0])
     assert record_is_missing(runs[0])
 
 
 def test_wrong_arguments_are_named(runs, tmp_path, capsys):
-    assert "--samples" in error_of(capsys, runs[0], "--samples", "0")
-    assert "--sequences 1: a standard error needs at least 2" in error_of(capsys, runs[0], "--digits", "1")
-    assert "the test split" in error_of(capsys, runs[0], "--digits", "13")
-    assert "--sequences" in error_of(capsys, runs[0], "--sequences", "most")
-    short = error_of(capsys, runs[0], "--scores", "open-loop", "--context", "5")
+    assert "--samples" in refusal(capsys, runs[0], "--samples", "0")
+    assert "--sequences 1: a standard error needs at least 2" in refusal(capsys, runs[0], "--digits", "1")
+    assert "the test split" in refusal(capsys, runs[0], "--digits", "13")
+    assert "--sequences" in refusal(capsys, runs[0], "--sequences", "most")
+    short = refusal(capsys, runs[0], "--scores", "open-loop", "--context", "5")
     assert "--context 5: sequence 2 of the test split" in short
     assert "has 5 steps, expected more. Choose a smaller context" in short
-    assert "invalid choice: 'bleu'" in error_of(capsys, runs[0], "--scores", "bleu")
-    assert "--device moon" in error_of(capsys, runs[0], "--device", "moon")
-    assert "no such run folder" in error_of(capsys, str(tmp_path / "nowhere"))
+    assert "invalid choice: 'bleu'" in refusal(capsys, runs[0], "--scores", "bleu")
+    assert "--device moon" in refusal(capsys, runs[0], "--device", "moon")
+    assert "no such run folder" in refusal(capsys, str(tmp_path / "nowhere"))
     (RunFolder(runs[0]).path / "evaluation.json").write_text("{")
-    assert "not JSON" in error_of(capsys, runs[0])
+    assert "not JSON" in refusal(capsys, runs[0])
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from forbes.commands.cli import main
 from forbes.data import SequenceDataModule
 from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder, read_metrics
-from forbes.training import world_model
+from forbes.training import seeded
 
 ONE_DEVICE = "A training uses one device"
 FLOAT32 = "expected 32-true or bf16-mixed. Densities and the recurrence are computed in float32"
@@ -163,7 +163,7 @@ def test_what_is_to_be_printed_is_printed(argument, value, text, tiny_config, in
 def test_no_two_batches_share_their_noise(argument, batches, tiny_config, in_tmp_path, monkeypatch):
     """Batches are drawn again only where `overfit_batches` asks for it."""
     drawn, noises = [], []
-    train_index, derive_seed = SequenceDataModule.train_index, world_model.derive_seed
+    train_index, derive_seed = SequenceDataModule.train_index, seeded.derive_seed
 
     def draw(self, number):
         drawn.append(number)
@@ -174,7 +174,7 @@ def test_no_two_batches_share_their_noise(argument, batches, tiny_config, in_tmp
         return derive_seed(seed, purpose, counter)
 
     monkeypatch.setattr(SequenceDataModule, "train_index", draw)
-    monkeypatch.setattr(world_model, "derive_seed", derive)
+    monkeypatch.setattr(seeded, "derive_seed", derive)
     assert main(["fit", "--config", str(tiny_config), f"--trainer.{argument}", "2"]) == 0
 
     assert drawn == batches

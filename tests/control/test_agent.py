@@ -8,14 +8,16 @@ from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.control.agent import Agent, explore, follow_plan, greedy
 from forbes.control.planning import CrossEntropy
 from forbes.control.policy import Actor
-from forbes.models import MLPDecoder, MLPEncoder, StateSpaceModel, VectorNormal
+from forbes.models import MLPDecoder, MLPEncoder, ModelParts, StateSpaceModel, VectorNormal
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
 
 
 def build(belief=GaussianBelief):
     torch.manual_seed(0)
-    model = StateSpaceModel(belief, MLPEncoder((3,), 8, 1), MLPDecoder(20, (3,), 8, 1), VectorNormal(), 2, 4, 16, 8, 1)
+    networks = {"encoder": MLPEncoder((3,), 8, 1), "decoder": MLPDecoder(16 + 4, (3,), 8, 1)}
+    sizes = {"action_dim": 2, "state_dim": 4, "hidden_dim": 16, "mlp_dim": 8, "mlp_layers": 1}
+    model = StateSpaceModel(ModelParts(belief, likelihood=VectorNormal(), **networks, **sizes))
     return model.eval(), Actor(20, 2, 8, 1)
 
 

@@ -5,7 +5,7 @@ import torch
 
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.control.planning import CrossEntropy, plan
-from forbes.models import Rollout, State, StateSpaceModel
+from forbes.models import ModelParts, Rollout, State, StateSpaceModel
 from forbes.models.likelihoods import VectorNormal
 from forbes.models.networks import MLPDecoder, MLPEncoder
 
@@ -65,7 +65,9 @@ def test_weighs_what_the_belief_holds_possible():
 @pytest.mark.parametrize("belief", [GaussianBelief, FlowBelief])
 def test_plans_on_the_beliefs_of_any_family(belief):
     torch.manual_seed(0)
-    model = StateSpaceModel(belief, MLPEncoder((3,), 8, 1), MLPDecoder(20, (3,), 8, 1), VectorNormal(), 2, 4, 16, 8, 1)
+    networks = {"encoder": MLPEncoder((3,), 8, 1), "decoder": MLPDecoder(16 + 4, (3,), 8, 1)}
+    sizes = {"action_dim": 2, "state_dim": 4, "hidden_dim": 16, "mlp_dim": 8, "mlp_layers": 1}
+    model = StateSpaceModel(ModelParts(belief, likelihood=VectorNormal(), **networks, **sizes))
     search = CrossEntropy(horizon=5, iterations=2, candidates=20, best=5)
 
     beliefs = model.sample_beliefs(model.encode(torch.randn(3, 6, 3), torch.randn(3, 6, 2)), 20)

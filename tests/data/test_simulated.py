@@ -60,5 +60,5 @@ def test_it_feeds_the_datamodule():
 
 
 def test_an_empty_split_is_named():
-    with pytest.raises(ForbesError, match=r"Simulated: test is 0, expected at least 1 sequence"):
+    with pytest.raises(ForbesError, match=r"Simulated: test is 0, expected at least 1"):
         Simulated(MountainHike(), test=0)

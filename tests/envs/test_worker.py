@@ -14,7 +14,9 @@ from processes import ends
 from toy_environments import Echo, Severed, Troubled, Unready
 
 from forbes.envs import BrokenEnvironmentError, EnvironmentProcess, find_environment, worker
+from forbes.envs.known_process import KnownProcess
 from forbes.errors import ForbesError
+from forbes.pomdps import TMaze
 
 ACTIONS = [np.array([value], np.float32) for value in (0.5, -0.25, 0.125, 1.0, 0.0, -1.0)]
 
@@ -58,6 +60,12 @@ def test_an_episode_is_truncated_at_the_limit_of_steps_unless_it_ends_before(end
 
 def test_no_episode_is_without_a_limit_of_steps(echo):
     assert echo.describe()["time_limit"] == 100_000
+
+
+@pytest.mark.parametrize(("limit", "expected"), [(100, 30), (10, 10)])
+def test_the_shorter_of_two_time_limits_is_told(limit, expected):
+    with EnvironmentProcess(partial(KnownProcess, TMaze(3), time_limit=30), time_limit=limit) as environment:
+        assert environment.describe()["time_limit"] == expected
 
 
 SENTENCES = {
@@ -209,6 +217,7 @@ NOTEBOOK = """
 import functools
 from forbes.envs import EnvironmentProcess
 from forbes.errors import ForbesError
+from forbes.pomdps import TMaze
 from toy_environments import Echo
 class Room(Echo):
     pass

@@ -7,7 +7,7 @@ from forbes.beliefs import FlowBelief
 from forbes.data import SequenceDataModule, Strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import complete, filter, first_of_each_class, imagine, whole_sequences
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, OnePixel, Rollout, StateSpaceModel
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ModelParts, OnePixel, Rollout, StateSpaceModel
 
 
 @pytest.fixture
@@ -19,8 +19,18 @@ def data(strokes_file):
 def model():
     torch.manual_seed(0)
     shape = (1, 28, 28)
-    model = StateSpaceModel(FlowBelief, MLPEncoder(shape, 8, 1), MLPDecoder(6, shape, 8, 1), Bernoulli(), 1, 2, 4, 8, 1)
-    return model.eval()
+    parts = ModelParts(
+        belief=FlowBelief,
+        encoder=MLPEncoder(shape, 8, 1),
+        decoder=MLPDecoder(4 + 2, shape, 8, 1),
+        likelihood=Bernoulli(),
+        action_dim=1,
+        state_dim=2,
+        hidden_dim=4,
+        mlp_dim=8,
+        mlp_layers=1,
+    )
+    return StateSpaceModel(parts).eval()
 
 
 @pytest.fixture

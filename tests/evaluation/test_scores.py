@@ -9,9 +9,9 @@ from torch import nn
 from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.evaluation.scores import frame_log_prob, score_particles, score_predictions, trajectories
+from forbes.evaluation.scores import frame_log_prob, score_particles, trajectories
 from forbes.evaluation.scoring import make_scorer, score_split
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, Normal, ParticleModel, StateSpaceModel
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ModelParts, Normal, ParticleModel, StateSpaceModel
 from forbes.seeding import derive_seed
 
 SHAPE, STEPS = (1, 4, 4), 5
@@ -34,9 +34,18 @@ class Certain(BeliefHead):
 
 def make_model(belief=Certain, likelihood=None, actions=2, build=StateSpaceModel):
     torch.manual_seed(0)
-    encoder, decoder = MLPEncoder(SHAPE, 6, 1), MLPDecoder(4 + 3, SHAPE, 6, 1)
-    model = build(belief, encoder, decoder, likelihood or Bernoulli(), actions, 3, 4, 8, 2)
-    return model.double().eval()
+    parts = ModelParts(
+        belief=belief,
+        encoder=MLPEncoder(SHAPE, 6, 1),
+        decoder=MLPDecoder(4 + 3, SHAPE, 6, 1),
+        likelihood=likelihood or Bernoulli(),
+        action_dim=actions,
+        state_dim=3,
+        hidden_dim=4,
+        mlp_dim=8,
+        mlp_layers=2,
+    )
+    return build(parts).double().eval()
 
 
 def make_batch(sequences=7, actions=2):
@@ -57,14 +66,6 @@ def in_batches(batch, size):
     return [(start, SequenceBatch(*(values[start : start + size] for values in batch))) for start in starts]
 
 
-@pytest.fixture(autouse=True)
-def float64(monkeypatch):
-    """Observations become float64 too, so that a tolerance says something about the formula."""
-    monkeypatch.setattr(Bernoulli, "target", lambda self, observation: observation.double())
-    monkeypatch.setattr(Normal, "target", lambda self, observation: observation.double() / self.scale - 0.5)
-    monkeypatch.setattr(torch.Tensor, "float", torch.Tensor.double)
-
-
 def elbo(model, batches, samples, **options):
     """The pass that `forbes evaluate` makes; its scores summed over the steps, (N,)."""
     scores = score_split(model, batches, make_scorer("elbo", samples, 1, 1), **options)
@@ -77,7 +78,7 @@ def plain_elbo(model, observation, action, steps):
     total = 0.0
     for t in range(steps):
         hidden = model.gru(model.transition(torch.cat((state, action[t : t + 1]), -1)), hidden)
-        target = model.likelihood.target(observation[t : t + 1])
+        target = model.likelihood.target(observation[t : t + 1]).double()
         context = model.posterior_context(torch.cat((hidden, model.encoder(target)), -1))
         state, log_posterior = model.posterior.rsample(context)
         log_prior = model.prior.log_prob(state, model.prior_context(hidden))
@@ -113,7 +114,7 @@ def plain_future(model, observation, action, context):
     found = []
     for t, frame in enumerate(observation):
         hidden = model.gru(model.transition(torch.cat((state, action[t : t + 1]), -1)), hidden)
-        target = model.likelihood.target(frame[None])
+        target = model.likelihood.target(frame[None]).double()
         seen = model.posterior_context(torch.cat((hidden, model.encoder(target)), -1))
         unseen = model.prior_context(hidden)
         state, _ = model.posterior.rsample(seen) if t < context else model.prior.rsample(unseen)
@@ -188,22 +189,6 @@ def test_the_fivo_bound_is_the_one_that_particles_are_trained_by():
 
     torch.testing.assert_close(scores["fivo"].sum(1), terms.elbo)
     assert (scores["ess"][batch.mask] < 0.5).any()
-
-
-def test_a_prediction_of_weighted_particles_is_their_weighted_mean():
-    model, batch = make_model(GaussianBelief, build=partial(ParticleModel, particles=5)), make_batch()
-    torch.manual_seed(3)
-    scores = score_predictions(model, batch, 10)  # two sets
-
-    torch.manual_seed(3)
-    seen = model.encode(batch.observation, batch.action)
-    likelihood = 0
-    with torch.no_grad():
-        for features, log_weight in (model.predict_one_step(seen) for _ in range(2)):
-            log_prob = torch.stack([model.log_likelihood(some, seen.target) for some in features])  # (K, B, T)
-            likelihood += (log_weight.exp() * log_prob.exp()).sum(0) / 2
-    torch.testing.assert_close(scores["pll"], likelihood.log() * batch.mask)
-    assert (log_weight.std(0)[:, 1:] > 0.01).any()
 
 
 def test_the_reported_value_is_the_mean_over_samples_and_depends_on_the_seed_alone():

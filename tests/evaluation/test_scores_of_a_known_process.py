@@ -9,9 +9,11 @@ from functools import partial
 import pytest
 import torch
 from linear_gaussian import drawn, gaussian, log_evidence
+from torch.nn.functional import softplus
 
 from forbes.data import SequenceBatch
 from forbes.evaluation import score_open_loop, score_particles, score_predictions, score_trajectories
+from forbes.evaluation.scores import frame_log_prob
 from forbes.models import ParticleModel
 
 ROUNDING = 1e-4  # of float32, in nats
@@ -85,6 +87,40 @@ def test_the_exponential_of_the_prequential_score_averages_to_the_one_step_predi
 
     assert_mean_is_one((pll[:, 0] - evidence[0]).exp())
     assert_mean_is_one((pll[:, 1] - (evidence[1] - evidence[0])).exp())
+
+
+def first_step(std_factor, shift):
+    """A model with another posterior, 20,000 filtered first steps, log p̂(o_1) by the prior alone and by both."""
+    model, observation, evidence = known(steps=1)
+    with torch.no_grad():
+        model.posterior.parameters_of.bias[:2] += shift
+        std = softplus(model.posterior.parameters_of.bias[2:]) + model.posterior.min_std
+        model.posterior.parameters_of.bias[2:] = (std_factor * std - model.posterior.min_std).expm1().log()
+    batch = copies(observation, 20_000)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        encoded = model.encode(batch.observation, batch.action)
+        score = partial(frame_log_prob, model)
+        both = model.predictive_log_prob(encoded, score)[:, 0]
+        hidden = model.filter(encoded.embedding, encoded.action).hidden
+        state, _ = model.prior.rsample(model.prior_context(hidden))
+        prior = score(torch.cat((hidden, state), -1)[:, 0], encoded.target[:, 0])
+    return [(values - evidence[0]).exp() for values in (prior, both)]
+
+
+@pytest.mark.parametrize(("std_factor", "shift"), [(1, 0), (0.3, 0), (3, 0), (1, 1.0)])
+def test_the_predictive_likelihood_is_unbiased_for_every_posterior(std_factor, shift):
+    """And never much worse than by the prior alone: its second moment is at most twice as large."""
+    prior, both = first_step(std_factor, shift)
+
+    assert_mean_is_one(both)
+    assert both.square().mean() < 2 * prior.square().mean()
+
+
+def test_a_good_posterior_makes_the_predictive_likelihood_precise():
+    prior, both = first_step(1, 0)
+
+    assert both.var() < 0.25 * prior.var()
 
 
 def test_many_particles_of_the_exact_belief_reach_the_evidence():

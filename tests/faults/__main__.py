@@ -59,7 +59,9 @@ def main() -> int:
     finally:
         shutil.rmtree(folder)
     rows = [_row(group, found) for group, found in zip(groups, outcomes, strict=True)]
-    table = "\n".join(["| promise | injected | cases | reached | broken |", "|---|---|---:|---:|---:|", *rows])
+    table = "\n".join(
+        ["| promise | test | injected | cases | reached | broken |", "|---|---|---|---:|---:|---:|", *rows]
+    )
     minutes = round((time.monotonic() - started) / 60)
     broken = [f"{outcome.what}: {complaint}" for found in outcomes for outcome in found for complaint in outcome.broken]
     notes = sorted({outcome.note for found in outcomes for outcome in found if outcome.note})
@@ -172,7 +174,19 @@ def _row(group: Group, outcomes: Sequence[Outcome]) -> str:
     count = collections.Counter[str]()
     for outcome in outcomes:
         count.update(cases=outcome.cases, reached=outcome.cases * outcome.reached, broken=len(outcome.broken))
-    return f"| {group.promise} | {group.injected} | {count['cases']} | {count['reached']} | {count['broken']} |"
+    counted = f"{count['cases']} | {count['reached']} | {count['broken']}"
+    return f"| {group.promise} | {_test_of(group)} | {group.injected} | {counted} |"
+
+
+def _test_of(group: Group) -> str:
+    """Name the functions of `tests/faults` that inject the faults of a group."""
+    names = {}
+    for task in group.tasks:
+        function = task
+        while isinstance(function, functools.partial):
+            function = function.func
+        names[f"`{function.__module__.rpartition('.')[2]}.{function.__name__}`"] = None
+    return ", ".join(names)
 
 
 def _here() -> dict[str, str]:

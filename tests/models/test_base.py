@@ -2,7 +2,19 @@
 
 import pytest
 import torch
-from small_models import ACTION, BATCH, HIDDEN, MODELS, SHAPE, TIME, make_model, random_model, random_state, sequences
+from small_models import (
+    ACTION,
+    BATCH,
+    HIDDEN,
+    MODELS,
+    PARTS,
+    SHAPE,
+    TIME,
+    make_model,
+    random_model,
+    random_state,
+    sequences,
+)
 
 from forbes.models import EncodedSequence, State, elbo_loss
 
@@ -35,30 +47,21 @@ def without_gradient(model):
     return [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
 
 
-def test_a_prediction_has_seen_what_was_before_it_and_nothing_else(kind):
+def test_a_predictive_likelihood_depends_on_nothing_later(kind):
     model, (observation, action, _) = random_model(kind), sequences()
     steered = action.clone()
     steered[:, T] += 1
 
     first, of_frame, of_action = (
-        seeded(model.predict_one_step, model.encode(*inputs))
+        seeded(model.predictive_log_prob, model.encode(*inputs), model.log_likelihood)
         for inputs in [(observation, action), (changed(observation, T), action), (observation, steered)]
     )
 
-    for kept, lost, other in [(T + 1, T + 1, of_frame), (T, T, of_action)]:
-        torch.testing.assert_close(other.features[:, :, :kept], first.features[:, :, :kept], rtol=0, atol=0)
-        torch.testing.assert_close(other.log_weight[:, :, :kept], first.log_weight[:, :, :kept], rtol=0, atol=0)
+    assert first.shape == (BATCH, TIME)
+    for other in (of_frame, of_action):  # the action of index T leads to o_T
+        torch.testing.assert_close(other[:, :T], first[:, :T], rtol=0, atol=0)
         # In some sequence: a small layer of ReLUs may be silent for one, and one-hot draws may be the same.
-        assert (other.features[:, :, lost] != first.features[:, :, lost]).any()
-
-
-def test_the_particles_of_a_prediction_weigh_one_together(kind):
-    model, (observation, action, _) = random_model(kind), sequences()
-
-    features, log_weight = seeded(model.predict_one_step, model.encode(observation, action))
-
-    assert features.shape[:3] == log_weight.shape == (model.particles, BATCH, TIME)
-    torch.testing.assert_close(log_weight.exp().sum(0), torch.ones(BATCH, TIME, dtype=torch.float64))
+        assert (other[:, T] != first[:, T]).any()
 
 
 def test_the_bound_of_a_prefix_is_the_prefix_of_the_bound(kind):
@@ -102,7 +105,7 @@ def test_beliefs_of_a_model_with_a_state_differ(kind):
 
     belief = torch.cat(seeded(model.sample_beliefs, model.encode(observation, action), 3 * model.particles), -1)
 
-    if MODELS[kind].keywords.get("state_dim") == 0:
+    if PARTS[kind].get("state_dim") == 0:
         assert len(belief.unique(dim=0)) == BATCH
     else:
         assert len(belief.unique(dim=0)) > 2 * BATCH
@@ -201,7 +204,7 @@ def test_a_saved_and_loaded_model_gives_identical_outputs(kind, tmp_path):
     results = []
 
     for each in (model, other):
-        terms = seeded(each.elbo, *batch)
+        terms = seeded(each.lower_bound, *batch)
         results.append((terms.reconstruction, terms.kl, *seeded(each.imagine, each.initial(BATCH), batch[1])))
 
     torch.testing.assert_close(results[0], results[1], rtol=0, atol=0)

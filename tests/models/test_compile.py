@@ -10,6 +10,7 @@ from forbes.models import (
     Bernoulli,
     MLPDecoder,
     MLPEncoder,
+    ModelParts,
     ParticleModel,
     StateSpaceModel,
     VectorModel,
@@ -17,24 +18,24 @@ from forbes.models import (
 )
 
 SHAPE = (1, 4, 4)
-MODELS = {  # and D
-    "gaussian": (partial(StateSpaceModel, GaussianBelief), 2),
-    "flow": (partial(StateSpaceModel, partial(FlowBelief, layers=2, width=4)), 2),
-    "spline flow": (partial(StateSpaceModel, partial(FlowBelief, layers=1, width=4, coupling="spline", bins=3)), 2),
-    "mixture": (partial(StateSpaceModel, partial(MixtureBelief, components=2)), 2),
-    "categorical": (partial(StateSpaceModel, partial(CategoricalBelief, classes=2)), 2),
-    "particles": (partial(ParticleModel, GaussianBelief, particles=3, resampling="soft"), 2),
-    "vector": (partial(VectorModel, GaussianBelief, overshoot=1), 0),
+MODELS = {  # the model, its belief, and D
+    "gaussian": (StateSpaceModel, GaussianBelief, 2),
+    "flow": (StateSpaceModel, partial(FlowBelief, layers=2, width=4), 2),
+    "spline flow": (StateSpaceModel, partial(FlowBelief, layers=1, width=4, coupling="spline", bins=3), 2),
+    "mixture": (StateSpaceModel, partial(MixtureBelief, components=2), 2),
+    "categorical": (StateSpaceModel, partial(CategoricalBelief, classes=2), 2),
+    "particles": (partial(ParticleModel, particles=3, resampling="soft"), GaussianBelief, 2),
+    "vector": (partial(VectorModel, overshoot=1), GaussianBelief, 0),
 }
 
 
 @pytest.fixture(params=MODELS, name="model")
 def model_fixture(request):
     torch.manual_seed(0)
-    build, state_dim = MODELS[request.param]
+    build, belief, state_dim = MODELS[request.param]
     encoder, decoder = MLPEncoder(SHAPE, 8, 1), MLPDecoder(6 + state_dim, SHAPE, 8, 1)
     sizes = {"action_dim": 1, "state_dim": state_dim, "hidden_dim": 6, "mlp_dim": 8, "mlp_layers": 1}
-    return build(encoder, decoder, Bernoulli(), **sizes)
+    return build(ModelParts(belief, encoder, decoder, Bernoulli(), **sizes))
 
 
 @pytest.fixture(autouse=True)

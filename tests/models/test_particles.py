@@ -10,7 +10,7 @@ from small_models import random_model, sequences
 
 from forbes.beliefs import GaussianBelief
 from forbes.errors import ForbesError
-from forbes.models import ParticleModel, StateSpaceModel
+from forbes.models import ModelParts, ParticleModel, StateSpaceModel
 from forbes.models.particles import effective_sample_size, run_particles, soft, systematic, systematic_resampling
 
 ROUNDING = 1e-4  # of float32, in nats or units of the state
@@ -45,11 +45,11 @@ def kalman(observation, transition, covariance):
     """Means of p(s_t | o_1:t) and of p(s_t | o_1:t-1), each (T, 2)."""
     emission, mean, spread = EMISSION.double(), torch.zeros(2, dtype=torch.float64), torch.zeros(2, 2).double()
     filtered, predicted = [], []
-    for encoded in observation:
+    for seen in observation:
         predicted.append(transition @ mean)
         spread = transition @ spread @ transition.T + covariance
         gain = spread @ emission.T @ torch.linalg.inv(emission @ spread @ emission.T + NOISE**2 * torch.eye(3))
-        mean = predicted[-1] + gain @ (encoded - emission @ predicted[-1])
+        mean = predicted[-1] + gain @ (seen - emission @ predicted[-1])
         spread = spread - gain @ emission @ spread
         filtered.append(mean)
     return torch.stack(filtered), torch.stack(predicted)
@@ -71,9 +71,8 @@ def assert_mean_is(values, expected):
 def test_one_particle_is_the_state_space_model(resampling):
     plain, batch = random_model("gaussian"), sequences()
     like = {name: getattr(plain, name) for name in ("encoder", "decoder", "likelihood", "state_dim", "hidden_dim")}
-    one = ParticleModel(
-        GaussianBelief, **like, action_dim=2, mlp_dim=9, mlp_layers=2, particles=1, resampling=resampling
-    ).double()
+    parts = ModelParts(GaussianBelief, **like, action_dim=2, mlp_dim=9, mlp_layers=2)
+    one = ParticleModel(parts, particles=1, resampling=resampling).double()
     one.load_state_dict(plain.state_dict())
 
     terms, expected = one.lower_bound(*batch), plain.lower_bound(*batch)
@@ -145,11 +144,16 @@ def test_predictions_are_those_of_the_kalman_filter(resampling):
     _, predicted = kalman(observation, exact[0], exact[2])
     torch.manual_seed(0)
 
-    with torch.no_grad():
-        features, log_weight = model.predict_one_step(seen_by(model, observation, 400))
+    def coordinate(features, target, d):
+        """A likelihood of 20 + s_d, whose mean tells that of s_d."""
+        return (20 + features[..., -2 + d].double()).log()
 
-    state = (log_weight.double().exp()[..., None] * features[..., -2:].double()).sum(0)  # (400, T, 2)
-    assert_mean_is(state, predicted)
+    with torch.no_grad():
+        encoded = seen_by(model, observation, 400)
+        likelihoods = (partial(coordinate, d=d) for d in range(2))
+        state = torch.stack([model.predictive_log_prob(encoded, each).exp() - 20 for each in likelihoods], -1)
+
+    assert_mean_is(state, predicted)  # (400, T, 2)
 
 
 def test_a_belief_is_drawn_as_often_as_its_weights_say(monkeypatch):

@@ -19,7 +19,7 @@ from small_models import (
 
 from forbes.beliefs import GaussianBelief
 from forbes.errors import ForbesError
-from forbes.models import Bernoulli, Filtered, MLPDecoder, MLPEncoder, State, StateSpaceModel, elbo_loss
+from forbes.models import Bernoulli, Filtered, MLPDecoder, MLPEncoder, ModelParts, State, StateSpaceModel, elbo_loss
 from forbes.models.networks import activate
 
 
@@ -33,7 +33,7 @@ def step_by_step(model, observation, action, kl="monte_carlo"):
     hidden, state = model.initial(len(observation))
     reconstruction, divergence = [], []
     for t in range(observation.shape[1]):
-        target = model.likelihood.target(observation[:, t])
+        target = model.likelihood.target(observation[:, t]).double()
         hidden = model.gru(model.transition(torch.cat((state, action[:, t]), -1)), hidden)
         context = model.posterior_context(torch.cat((hidden, model.encoder(target)), -1))
         state, log_posterior = model.posterior.rsample(context)
@@ -293,17 +293,18 @@ def test_imagination_is_the_plain_loop_over_the_prior(family):
 def bistable_model():
     """A prior that drives s > 0 to 3 and s < 0 to -3: N(3 clip(10 s, -1, 1), 0.5²), the clip made of two ReLUs."""
     scale = 1e-4  # of h, so small that the GRU's tanh is linear
-    model = StateSpaceModel(
-        partial(GaussianBelief, min_std=0.5),
-        MLPEncoder(SHAPE, 4, 1),
-        MLPDecoder(4 + 2, SHAPE, 4, 1),
-        Bernoulli(),
+    parts = ModelParts(
+        belief=partial(GaussianBelief, min_std=0.5),
+        encoder=MLPEncoder(SHAPE, 4, 1),
+        decoder=MLPDecoder(4 + 2, SHAPE, 4, 1),
+        likelihood=Bernoulli(),
         action_dim=0,
         state_dim=2,
         hidden_dim=4,
         mlp_dim=4,
         mlp_layers=1,
     )
+    model = StateSpaceModel(parts)
     eye = torch.eye(2)
     with torch.no_grad():
         for parameter in model.parameters():

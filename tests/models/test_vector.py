@@ -10,7 +10,7 @@ from forbes.beliefs import GaussianBelief
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.evaluation.scores import score_predictions
-from forbes.models import MLPDecoder, MLPEncoder, OneHot, VectorModel, elbo_loss
+from forbes.models import MLPDecoder, MLPEncoder, ModelParts, OneHot, VectorModel, elbo_loss
 
 
 @pytest.fixture
@@ -22,7 +22,8 @@ def make_vector_model(state_dim=0, overshoot=2):
     """Of sequences of three symbols."""
     torch.manual_seed(0)
     encoder, decoder = MLPEncoder((3,), 5, 1), MLPDecoder(6, (3,), 5, 1)
-    return VectorModel(GaussianBelief, encoder, decoder, OneHot(), 0, state_dim, 6, 7, 1, overshoot=overshoot)
+    sizes = {"action_dim": 0, "state_dim": state_dim, "hidden_dim": 6, "mlp_dim": 7, "mlp_layers": 1}
+    return VectorModel(ModelParts(GaussianBelief, encoder, decoder, OneHot(), **sizes), overshoot)
 
 
 def chain_rule(model, observation, action):
@@ -31,7 +32,7 @@ def chain_rule(model, observation, action):
     each = []
     for t in range(observation.shape[1]):
         hidden = model.gru(model.transition(torch.cat((before, action[:, t]), -1)), hidden)
-        target = model.likelihood.target(observation[:, t])
+        target = model.likelihood.target(observation[:, t]).double()
         each.append(model.likelihood.log_prob(model.decoder(hidden), target))
         before = model.encoder(target)
     return torch.stack(each, 1)
@@ -42,7 +43,7 @@ def rolled_on(model, observation, action, start, steps):
     hidden, before = model.initial(1)
     for t in range(start + 1):
         hidden = model.gru(model.transition(torch.cat((before, action[None, t]), -1)), hidden)
-        before = model.encoder(model.likelihood.target(observation[None, t]))
+        before = model.encoder(model.likelihood.target(observation[None, t]).double())
     total = torch.zeros((), dtype=torch.float64)
     for t in range(start + 1, start + 1 + steps):
         hidden = model.gru(model.transition(torch.cat((model.nothing[None], action[None, t]), -1)), hidden)
@@ -102,7 +103,8 @@ def test_the_first_imagined_step_is_the_prediction_and_later_ones_see_nothing(mo
 
     features = rollout.features.view(2, BATCH, TIME - 3, HIDDEN)
     torch.testing.assert_close(features[0], features[1])
-    torch.testing.assert_close(features[0, :, 0], model.predict_one_step(encoded).features[0, :, 3])
+    predicted = model.predictive_log_prob(encoded, model.log_likelihood)[:, 3]
+    torch.testing.assert_close(model.log_likelihood(features[0, :, 0], encoded.target[:, 3]), predicted)
     hidden = features[0, :, 0]
     for t in range(4, TIME):
         inputs = torch.cat((model.nothing.expand(BATCH, -1), action[:, t]), -1)

@@ -10,8 +10,8 @@ import yaml
 from forbes.commands.cli import main
 from forbes.errors import ForbesError
 from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
-from forbes.training.loading import load_run
 from forbes.runs.folder import RunFolder
+from forbes.training.loading import load_run
 
 
 @pytest.fixture

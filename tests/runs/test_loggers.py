@@ -10,8 +10,8 @@ import yaml
 from lightning.pytorch.loggers import CometLogger, LitLogger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from forbes.commands.cli import main
-from forbes.runs.loggers import open_logger
 from forbes.runs.folder import read_metrics
+from forbes.runs.loggers import open_logger
 
 TENSORBOARD = ["--trainer.logger", "TensorBoardLogger"]
 

@@ -7,8 +7,8 @@ import signal
 import pytest
 
 from forbes.commands.cli import main
-from forbes.training import WorldModel
 from forbes.runs.progress import PlainProgress, TerminalProgress, progress
+from forbes.training import WorldModel
 
 
 @pytest.mark.parametrize(("terminal", "kind"), [(True, TerminalProgress), (False, PlainProgress)])

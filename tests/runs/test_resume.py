@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from forbes.commands.cli import main
-from forbes.training import WorldModel
 from forbes.runs.checkpoint import ResumeWholeEpochs, read_checkpoint
-from forbes.runs.provenance import read_provenance
 from forbes.runs.folder import RunFolder, read_metrics
+from forbes.runs.provenance import read_provenance
+from forbes.training import WorldModel
 
 FOUR_EPOCHS = ["--trainer.max_epochs", "4"]  # of five updates
 

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from forbes.errors import ForbesError
-from forbes.runs.metrics_log import JsonLinesLogger
 from forbes.runs.folder import RunFolder, experiment_name, read_config, read_metrics
+from forbes.runs.metrics_log import JsonLinesLogger
 
 
 @pytest.mark.parametrize(

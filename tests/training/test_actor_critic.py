@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from forbes.beliefs import FlowBelief, GaussianBelief
-from forbes.control.imagination import belief_samples
+from forbes.control.actor_critic import sample_starts
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.models import MLPDecoder, MLPEncoder, State, VectorNormal
@@ -147,7 +147,7 @@ def test_the_first_sample_is_the_path_the_filter_took_and_all_differ(belief):
     model, batch = agent(belief=belief).model, make_batch()
     filtered = model.filter(model.embed(batch.observation), batch.action)
 
-    one, four = belief_samples(model, filtered, 1), belief_samples(model, filtered, 4)
+    one, four = sample_starts(model, filtered, 1), sample_starts(model, filtered, 4)
 
     torch.testing.assert_close(one, State(filtered.hidden[None], filtered.state[None]))
     torch.testing.assert_close(four.state[0], filtered.state)
@@ -170,7 +170,7 @@ def test_imagined_rewards_and_values_belong_to_the_states_they_are_of(entropy, t
     actor, critic = ours.control_losses(filtered, batch.mask)
 
     torch.manual_seed(3)
-    state = State(*(values.flatten(0, 2) for values in belief_samples(ours.model, filtered, trajectories)))
+    state = State(*(values.flatten(0, 2) for values in sample_starts(ours.model, filtered, trajectories)))
     nats, states = [], []
     for _ in range(4):
         action, log_prob = ours.actor(torch.cat(state, -1).detach()).rsample()
@@ -208,7 +208,7 @@ def test_the_reward_of_entropy_brings_an_actor_back_from_the_border(side):
     assert slope[1e-2] > 10 * abs(slope[0.0])
 
 
-def test_what_lies_on_padding_changes_nothing_of_thecontrol_losses():
+def test_what_lies_on_padding_changes_nothing_of_the_control_losses():
     ours, batch = agent(trajectories=2), make_batch()
     filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     batch.mask[:, 3:] = False
@@ -295,7 +295,7 @@ def test_an_agent_that_foresees_the_end_at_once_is_paid_the_first_reward_only():
     actor, critic = ours.control_losses(filtered, batch.mask)
 
     torch.manual_seed(3)
-    belief_samples(ours.model, filtered, 1)
+    sample_starts(ours.model, filtered, 1)
     action, _ = ours.actor(filtered.features[:, 0]).rsample()
     state = ours.model.imagine(State(filtered.hidden[:, 0], filtered.state[:, 0]), action[:, None]).features[0, 0]
     torch.testing.assert_close(actor, -ours.reward(state) / 3)

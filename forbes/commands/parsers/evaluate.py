@@ -23,7 +23,7 @@ certain. So beside it:
 
   elbo       the bound and its parts, S trajectories, on the whole split
   pll        log p(o_t | o_1..t-1) summed over t, by K particles of the belief: the proper score of the filtering
-             belief; and the IWAE bound, by the same trajectories
+             belief. The posterior helps to estimate it, without bias. And the IWAE bound, by the same trajectories
   fivo       the sequential Monte-Carlo bound, by K particles, and their effective sample size
   open-loop  log p(rest | beginning), by K futures that start in the belief; with pll, the degradation: how much a
              prediction loses with each step that it has not seen

@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from forbes.data.episodes.store import EpisodeWriter
 from forbes.data.episodes.episode import Episode, EpisodeRecord
+from forbes.data.episodes.store import EpisodeWriter
 from forbes.envs import BrokenEnvironmentError, Environment, Step
 from forbes.errors import ForbesError
 from forbes.seeding import derive_seed

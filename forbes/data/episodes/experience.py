@@ -9,10 +9,10 @@ from torch import Tensor
 
 from forbes.choices import LONGEST
 from forbes.data.episodes.collection import MakePolicy, collect_episodes, describe_environment, episode_seed
-from forbes.data.episodes.store import EpisodeStore, EpisodeWriter, first_held
 from forbes.data.episodes.episode import EpisodeRecord
-from forbes.data.episodes.worker import EpisodeWorker
 from forbes.data.episodes.replay import Replay, Segments
+from forbes.data.episodes.store import EpisodeStore, EpisodeWriter, first_held
+from forbes.data.episodes.worker import EpisodeWorker
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.envs import TIME_LIMIT, EnvironmentProcess, find_environment
 from forbes.errors import ForbesError

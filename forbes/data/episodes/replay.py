@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forbes.data.episodes.store import EpisodeStore, first_held
 from forbes.data.episodes.episode import EpisodeRecord
+from forbes.data.episodes.store import EpisodeStore, first_held
 from forbes.data.source import SequenceBatch, SequenceSource, Split
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.seeding import generator
 from forbes.shapes import printed_by_shape
 
@@ -78,8 +78,7 @@ class Replay(SequenceSource):
             raise ForbesError(f"Replay: capacity is {capacity}, expected at least 1 step, or null for all")
         if hold_out != 0 and hold_out < 3:
             raise ForbesError(f"Replay: hold_out is {hold_out}, expected 0 or at least 3. Choose another")
-        if stride < 1:
-            raise ForbesError(f"Replay: stride is {stride}, expected at least 1")
+        require_at_least(1, "Replay", stride=stride)
         self.path, self.capacity, self.hold_out, self.stride = path, capacity, hold_out, stride
         self.store = EpisodeStore(path)
         self.store.require_episodes()
@@ -159,8 +158,7 @@ class Replay(SequenceSource):
 
     def gather(self, split: Split, index: Tensor, length: int) -> Segments:
         """Copy windows by index, int64 (B,), from the mapped files."""
-        if length < 1:
-            raise ForbesError(f"Replay: length is {length}, expected at least 1 step.")
+        require_at_least(1, "Replay", length=length)
         table, count, stride = self._require(split), len(index), self._stride(split)
         row = torch.searchsorted(table.ends, index, right=True)  # (B,)
         windows = -(-table.lengths // stride)  # (E,)

@@ -21,7 +21,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
-from forbes.data.episodes.index import EpisodeIndex
 from forbes.data.episodes.episode import (
     DamagedEpisodeError,
     Episode,
@@ -32,6 +31,7 @@ from forbes.data.episodes.episode import (
     problem_with,
     read_record,
 )
+from forbes.data.episodes.index import EpisodeIndex
 from forbes.errors import ForbesError
 from forbes.files import drop_half_line, locked, remove_halves, replace_file
 

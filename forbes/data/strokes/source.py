@@ -12,7 +12,7 @@ from forbes.data.download import bundled
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.strokes.dejong import dejong_path, verify_dejong
 from forbes.data.strokes.file import SIDE, StrokeArrays, load_strokes, sha256_of_arrays
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.shapes import printed_by_shape
 
 __all__ = ["StrokePoints", "Strokes", "bundled_path"]
@@ -78,10 +78,8 @@ class Strokes(SequenceSource):
         validation: int = 5000,
         frames: Literal["written", "whole"] = "written",
     ) -> None:
-        if points_per_step < 1:
-            raise ForbesError(f"Strokes: points_per_step is {points_per_step}, expected at least 1.")
-        if validation < 0:
-            raise ForbesError(f"Strokes: validation is {validation}, expected at least 0.")
+        require_at_least(1, "Strokes", points_per_step=points_per_step)
+        require_at_least(0, "Strokes", validation=validation)
         self.origin = origin
         self.path = path
         self.points_per_step = points_per_step
@@ -139,8 +137,7 @@ class Strokes(SequenceSource):
 
     def gather(self, split: Split, index: Tensor, length: int) -> StrokePoints:
         """Collect the paths of digits `index`, int64 (B,), cut or padded to `length` steps."""
-        if length < 1:
-            raise ForbesError(f"Strokes: length is {length}, expected at least 1 step.")
+        require_at_least(1, "Strokes", length=length)
         points, offsets = self._tensors[split]
         first = offsets[index]  # (B,)
         number = (offsets[index + 1] - first).clamp(max=length * self.points_per_step)  # (B,)

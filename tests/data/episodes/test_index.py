@@ -12,8 +12,8 @@ import pytest
 
 from forbes.commands.cli import main
 from forbes.data import Replay
-from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.data.episodes.episode import DamagedEpisodeError, Episode
+from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.errors import ForbesError
 
 ENVIRONMENT = {"task": "Counting", "observation_shape": [2], "action_dim": 1, "discrete": False}

@@ -11,8 +11,8 @@ from toy_environments import Echo
 from forbes.commands.cli import main
 from forbes.data import Replay, SequenceDataModule
 from forbes.data.episodes.collection import play, random_policy
-from forbes.data.episodes.store import EpisodeWriter
 from forbes.data.episodes.episode import Episode, pack_episode
+from forbes.data.episodes.store import EpisodeWriter
 from forbes.errors import ForbesError
 from forbes.runs.checkpoint import read_checkpoint
 

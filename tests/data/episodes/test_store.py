@@ -9,8 +9,8 @@ import signal
 import numpy as np
 import pytest
 
-from forbes.data.episodes.store import EpisodeStore, EpisodeWriter, first_held
 from forbes.data.episodes.episode import DamagedEpisodeError, Episode
+from forbes.data.episodes.store import EpisodeStore, EpisodeWriter, first_held
 from forbes.errors import ForbesError
 
 ENVIRONMENT = {"task": "Counting", "observation_shape": [2], "action_dim": 1, "discrete": False}

@@ -19,7 +19,7 @@ from forbes.evaluation.digits.completions import (
 )
 from forbes.evaluation.digits.neighbours import Beginnings, last_frame, mean_frame
 from forbes.evaluation.scoring import score_split
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, StateSpaceModel
+from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ModelParts, StateSpaceModel
 
 CONTEXT, LENGTH = 5, 30
 
@@ -49,8 +49,18 @@ def batch(data, beginnings):
 def model():
     torch.manual_seed(0)
     shape = (1, 28, 28)
-    parts = MLPEncoder(shape, 8, 1), MLPDecoder(6, shape, 8, 1, output_bias=-4.0), Bernoulli()
-    return StateSpaceModel(GaussianBelief, *parts, 0, 2, 4, 8, 1).eval()
+    parts = ModelParts(
+        belief=GaussianBelief,
+        encoder=MLPEncoder(shape, 8, 1),
+        decoder=MLPDecoder(4 + 2, shape, 8, 1, output_bias=-4.0),
+        likelihood=Bernoulli(),
+        action_dim=0,
+        state_dim=2,
+        hidden_dim=4,
+        mlp_dim=8,
+        mlp_layers=1,
+    )
+    return StateSpaceModel(parts).eval()
 
 
 def repeated(batch, count):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from forbes.control.returns import actor_loss, critic_loss, lambda_returns
+from forbes.control.actor_critic import actor_loss, critic_loss, lambda_returns
 
 GAMMA = 0.9
 CONSTANT = torch.full((4,), GAMMA, dtype=torch.float64)

@@ -1,0 +1,1 @@
+"""Run folders: configuration, checkpoints, metrics and provenance, and how they are loaded again."""

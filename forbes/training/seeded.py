@@ -1,0 +1,123 @@
+"""What every training shares: noise that depends on the seed, learning rates, and what is logged."""
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, cast
+
+import torch
+from lightning import LightningModule
+from torch import Tensor, nn
+from torch.optim import Adam, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from forbes.data import SequenceBatch
+from forbes.seeding import derive_seed
+from forbes.training.divergence import hold_unless_finite
+
+__all__ = ["Group", "Schedule", "SeededModule"]
+
+Schedule: TypeAlias = Literal["constant", "cosine"]
+
+
+class Group(NamedTuple):
+    """Parameters that share a learning rate, and whose gradients are clipped together."""
+
+    name: str
+    parameters: list[nn.Parameter]
+    rate: float
+
+
+class SeededModule(LightningModule, ABC):
+    r"""A LightningModule whose training is a function of its seed, also when it is interrupted and resumed.
+
+    The noise of an update depends on the seed and the number of the update, that of a validation on the seed. The
+    learning rate of Adam in update n of N is
+
+    .. math:: \min(1, \tfrac{n + 1}{\mathrm{warmup}})\,\mathrm{rate} \quad\text{and with a cosine times}\quad
+              \tfrac12 (1 + \cos \tfrac{\pi n}{N})
+
+    A subclass implements, in the order in which they are called:
+
+    - `groups`: parameters and their learning rates; one group of all parameters by default.
+    - `training_step`: the loss of an update.
+    - `measure`: what a validation or a test logs of a batch.
+    - `objective_name`: which of these values says how well the training goes.
+
+    Args:
+        learning_rate: learning rate of Adam at its highest.
+        seed: random seed of the noise of training and validation.
+        schedule: "constant", or "cosine" to 0 at the end of the training.
+        warmup: updates over which the learning rate rises from 0.
+    """
+
+    adam_eps: ClassVar[float] = 1e-8
+
+    def __init__(self, learning_rate: float, seed: int, schedule: Schedule = "constant", warmup: int = 0) -> None:
+        super().__init__()
+        self.learning_rate, self.seed, self.schedule, self.warmup = learning_rate, seed, schedule, warmup
+
+    def groups(self) -> list[Group]:
+        """Return which parameters share a learning rate and are clipped together."""
+        return [Group("model", [*self.parameters()], self.learning_rate)]
+
+    @abstractmethod
+    def measure(self, batch: SequenceBatch) -> dict[str, Tensor]:
+        """Return what a validation or a test logs of a batch: scalars by name."""
+
+    @property
+    @abstractmethod
+    def objective_name(self) -> str:
+        """Name the metric, without its split, that says how well the training goes."""
+
+    def configure_optimizers(self) -> Any:
+        """Return Adam and its schedule. It is fused, since a step over many small tensors is bound by calls."""
+        groups = [{"params": group.parameters, "lr": group.rate} for group in self.groups()]
+        optimizer = Adam(groups, eps=self.adam_eps, fused=True)
+        scheduler = LambdaLR(optimizer, self._rate)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_train_start(self) -> None:
+        """Set the learning rates of the configuration: a checkpoint brings its own, which may have changed since."""
+        scheduler = cast(LambdaLR, self.lr_schedulers())
+        scheduler.base_lrs = [group.rate for group in self.groups()]
+        groups = scheduler.optimizer.param_groups
+        for group, rate, factor in zip(groups, scheduler.base_lrs, scheduler.lr_lambdas, strict=True):
+            group["lr"] = rate * factor(scheduler.last_epoch)
+
+    def hold_unless_finite(self, optimizer: Optimizer, norm: Tensor) -> None:
+        """Let the optimiser change nothing from this update on, if the norm of a gradient is not finite."""
+        hold_unless_finite(optimizer, norm, self.global_step)
+
+    def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
+        """Seed the noise of this batch, so that a resumed run draws the same."""
+        torch.manual_seed(derive_seed(self.seed, "update", self.batches_before))
+
+    def on_validation_epoch_start(self) -> None:
+        """Seed the noise of a validation, the same each time."""
+        torch.manual_seed(derive_seed(self.seed, "validation", 0))
+
+    def validation_step(self, batch: SequenceBatch, batch_idx: int) -> None:
+        """Log `measure` of the validation split."""
+        self.log_split("val", self.measure(batch), batch)
+
+    def test_step(self, batch: SequenceBatch, batch_idx: int) -> None:
+        """Log `measure` of the test split. `forbes evaluate` and `forbes beliefs` measure more carefully."""
+        self.log_split("test", self.measure(batch), batch)
+
+    def log_split(self, split: str, values: dict[str, Tensor], batch: SequenceBatch) -> None:
+        """Log scalars of a batch by name, as `train/name`."""
+        self.log_dict({f"{split}/{name}": value for name, value in values.items()}, batch_size=len(batch.mask))
+
+    @property
+    def batches_before(self) -> int:
+        """Number of training batches before the current one; equal to the updates unless gradients accumulate."""
+        trainer = self._trainer
+        return 0 if trainer is None else trainer.fit_loop.total_batch_idx
+
+    def _rate(self, update: int) -> float:
+        """Return the learning rate of an update as a fraction of the group's."""
+        rise = min(1.0, (update + 1) / self.warmup) if self.warmup else 1.0
+        if self.schedule == "constant":
+            return rise
+        done = min(1.0, update / self.trainer.estimated_stepping_batches)
+        return rise * 0.5 * (1 + math.cos(math.pi * done))
