@@ -1,9 +1,9 @@
 """FORBES as one writes it first: both flows in the time loop, zuko's transforms, plain modules. The form to beat.
 
 As in Dreamer's published code, the encoder runs before the loop and the decoder after it, once over (B·T). In the
-loop, each step calls the transition, the GRU cell, the prior's and the posterior's networks, builds both flows anew
-for its context as zuko does, samples the posterior's and inverts the prior's. The conditioner is ours (zuko has the
-same parts); the sum is the same bound, to rounding.
+loop, each step calls the transition, the GRU cell, and the networks of prior and posterior. It builds both flows for
+its context, as zuko does, samples the posterior's and inverts the prior's. The conditioner is ours, from zuko's parts.
+The bound is the same up to rounding.
 """
 
 import copy
@@ -73,7 +73,7 @@ class TextbookFlow(nn.Module):
         self.transform = zuko.lazy.LazyComposedTransform(*parts)
 
     def forward(self, context: Tensor) -> zuko.distributions.NormalizingFlow:
-        """Build the belief of a context."""
+        """Return the belief given a context."""
         # zuko's transforms go from data to noise, ours from noise to data.
         return zuko.distributions.NormalizingFlow(
             self.transform(context).inv, Independent(Normal(*self.base.moments(context)), 1)
@@ -81,10 +81,10 @@ class TextbookFlow(nn.Module):
 
 
 class Textbook(nn.Module):
-    """The model with a copy of the given one's weights.
+    """A state-space model in the textbook form, with a copy of a given model's weights.
 
     Args:
-        model: a state-space model with flow beliefs.
+        model: state-space model with flow beliefs, whose weights are copied.
     """
 
     def __init__(self, model: StateSpaceModel) -> None:
@@ -93,8 +93,8 @@ class Textbook(nn.Module):
         self.prior, self.posterior = TextbookFlow(model.prior), TextbookFlow(model.posterior)
         del self.model.prior, self.model.posterior
 
-    def elbo(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
-        """Estimate the bound as `StateSpaceModel.lower_bound` does."""
+    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor) -> ElboTerms:
+        """Estimate the bound as `StateSpaceModel.lower_bound` does, one step after the other."""
         model = self.model
         embedding = model.embed(observation)
         hidden, state = model.initial(len(embedding))

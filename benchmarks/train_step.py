@@ -1,10 +1,10 @@
-"""What an update costs: flow against Gaussian, ours against the textbook form, compiled against eager, and the memory.
+"""The cost of an update: flow and Gaussian, our form and the textbook form, eager and compiled; and the memory.
 
-    python benchmarks/train_step.py                one thread; writes the table beside this file
+    python benchmarks/train_step.py                one thread; writes the table next to this file
 
-All forms of a shape take turns, one update each, so that whatever else the machine does meets them alike. Times are of
-the processor, which other programs disturb less than the clock on the wall; with one thread both are the same on an
-idle machine. The ratios are medians over rounds. Memory is measured in a fresh process per form.
+All forms of a shape take turns, one update each, so that other programs on the machine affect them equally. Times are
+CPU times, which other programs disturb less than wall-clock times; with one thread both are equal on an idle machine.
+The ratios are medians over rounds. Memory is measured in a new process per form.
 """
 
 import argparse
@@ -35,11 +35,11 @@ ROOT = Path(__file__).parents[1]
 SHAPES = ("strokes", "dmc")
 FORMS = ("gaussian", "flow", "textbook")
 ACTIONS = 6  # of cheetah-run
-TOLERANCE = 1e-4  # relative, between the losses of ours and the textbook form
+TOLERANCE = 1e-4  # relative difference between the losses of our form and the textbook form
 
 
 def experiment(name: str) -> tuple[WorldModel, SequenceDataModule]:
-    """Build model and data of a configuration of digit strokes."""
+    """Return model and data of a configuration of digit strokes."""
     allow_modules()
     config = yaml.safe_load((ROOT / "configs" / "strokes" / name).read_text())
     parser = experiment_parser()
@@ -48,13 +48,13 @@ def experiment(name: str) -> tuple[WorldModel, SequenceDataModule]:
 
 
 def strokes(form: str) -> tuple[WorldModel, SequenceBatch]:
-    """Build the default experiment on digit strokes and its first batch."""
+    """Return the model of the default experiment on digit strokes, and its first batch."""
     world, data = experiment("rssm.yaml" if form == "gaussian" else "forbes.yaml")
     return world, data.sequences("train", data.train_index(0))
 
 
 def dmc(form: str, batch: int) -> tuple[WorldModel, SequenceBatch]:
-    """Build the paper's model for DeepMind Control, whose sizes are the class defaults, and a batch of noise."""
+    """Return the paper's model for DeepMind Control, whose sizes are the class defaults, and a batch of noise."""
     world = WorldModel(GaussianBelief if form == "gaussian" else FlowBelief, action_dim=ACTIONS)
     shape = (batch, 50)
     observation = torch.randint(256, (*shape, 3, 64, 64), dtype=torch.uint8)
@@ -90,24 +90,24 @@ class Update:
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-5, eps=1e-7, fused=True)
 
     def eager_loss(self) -> Tensor:
-        """Give the training loss."""
+        """Return the training loss."""
         terms = self.model.lower_bound(self.batch.observation, self.batch.action, self.batch.mask)
         return elbo_loss(terms, self.world.free_nats, self.world.free_nats_per)
 
     def loss_of_noise(self, seed: int) -> float:
-        """Give the loss with the noise of a seed."""
+        """Return the training loss with the noise of a seed."""
         torch.manual_seed(seed)
         with torch.no_grad():
             return self.eager_loss().item()
 
     def operations(self) -> int:
-        """Count the tensor operations of an update: a number that no other program disturbs."""
+        """Return the number of tensor operations of an update, which no other program disturbs."""
         with Operations() as operations:
             self()
         return operations.number
 
     def __call__(self) -> float:
-        """Make the update and give the seconds of processor time it took."""
+        """Make an update and return the seconds of CPU time it took."""
         start = time.process_time()
         self.optimizer.zero_grad()
         self.loss().backward()
@@ -117,7 +117,7 @@ class Update:
 
 
 def interleaved(updates: dict[str, Update], repeats: int) -> dict[str, list[float]]:
-    """Time updates in turns: the seconds of each round, after two rounds that do not count."""
+    """Time updates in turns and return the seconds of each round, without the first two rounds."""
     seconds: dict[str, list[float]] = {form: [] for form in updates}
     for _ in range(repeats + 2):
         for form, update in updates.items():
@@ -126,13 +126,13 @@ def interleaved(updates: dict[str, Update], repeats: int) -> dict[str, list[floa
 
 
 def ratio(times: list[float], others: list[float]) -> float:
-    """Compare two forms round by round and give the median."""
+    """Return the median over rounds of the ratio of two forms."""
     return statistics.median(a / b for a, b in zip(times, others, strict=True))
 
 
 def compiled(update: Update) -> float:
-    """Compile the loss of an update without graph breaks and give the seconds until the first update is done."""
-    torch._inductor.config.force_disable_caches = True  # what an earlier run has left
+    """Compile the loss of an update without graph breaks; return the seconds until the first update is done."""
+    torch._inductor.config.force_disable_caches = True  # do not reuse what an earlier run compiled
     start = time.perf_counter()
     update.loss = torch.compile(update.eager_loss, fullgraph=True)
     update()
@@ -140,7 +140,7 @@ def compiled(update: Update) -> float:
 
 
 def memory(shape: str, form: str, threads: int, dmc_batch: int) -> float:
-    """Give the MiB that two updates add to a process that holds model and batch."""
+    """Return the MiB that two updates add to a process that holds model and batch."""
     torch.set_num_threads(threads)
     update = Update(shape, form, dmc_batch)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -151,16 +151,16 @@ def memory(shape: str, form: str, threads: int, dmc_batch: int) -> float:
 
 
 def common_options(description: str | None, repeats: int, of_what: str) -> argparse.ArgumentParser:
-    """Give the parser of what every benchmark can be told; the table goes beside the file that is run."""
+    """Return a parser of the options that all benchmarks share; by default the table is written next to the script."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    parser.add_argument("--threads", type=int, default=1, help="number of threads of torch")
     parser.add_argument("--repeats", type=int, default=repeats, help=of_what)
     parser.add_argument("--output", type=Path, default=Path(sys.argv[0]).with_suffix(".md"))
     return parser
 
 
 def conditions(options: argparse.Namespace, machine: str = platform.machine()) -> str:
-    """Say what a table was measured with."""
+    """Return a sentence on how a table was measured."""
     return (
         f"torch {torch.__version__} on {machine}, {options.threads} thread(s), medians of {options.repeats} "
         f"interleaved rounds, load average {os.getloadavg()[0]:.1f}."
@@ -168,18 +168,18 @@ def conditions(options: argparse.Namespace, machine: str = platform.machine()) -
 
 
 def publish(table: list[str], options: argparse.Namespace) -> None:
-    """Write the table, and print it."""
+    """Write the table to a file and print it."""
     options.output.write_text("\n".join(table) + "\n")
     print("\n".join(table))
 
 
 def say(line: str) -> None:
-    """Report progress."""
+    """Print a line of progress."""
     print(line, file=sys.stderr, flush=True)
 
 
 def memories(options: argparse.Namespace) -> dict[tuple[str, str], float]:
-    """Measure the memory of every form; before all else, since a child's peak begins at its parent's size."""
+    """Measure the memory of every form. Call it first, since a child's peak begins at its parent's size."""
     result = {}
     for shape in options.shapes:
         for form in FORMS:
@@ -190,7 +190,7 @@ def memories(options: argparse.Namespace) -> dict[tuple[str, str], float]:
 
 
 def measure(shape: str, needed: dict[tuple[str, str], float], options: argparse.Namespace) -> list[str]:
-    """Measure one shape: the rows of the table."""
+    """Measure one shape and return the rows of the table."""
     updates = {form: Update(shape, form, options.dmc_batch) for form in FORMS}
     ours, theirs = updates["flow"].loss_of_noise(0), updates["textbook"].loss_of_noise(0)
     assert abs(ours - theirs) <= TOLERANCE * abs(theirs), f"losses differ: {ours} and {theirs}"

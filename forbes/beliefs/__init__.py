@@ -1,4 +1,4 @@
-"""Belief families: conditional densities over the stochastic state, one file each, all through `BeliefHead`."""
+"""Belief families: conditional densities over the stochastic state, one per file. All derive from `BeliefHead`."""
 
 from forbes.beliefs.base import BeliefFamily, BeliefHead
 from forbes.beliefs.categorical import CategoricalBelief

@@ -13,13 +13,14 @@ from forbes.performance.time_loop import TimeLoop
 __all__ = ["BeliefFamily", "BeliefHead", "Sampler"]
 
 Sampler: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""A context `(B, C)` to a sample s `(B, D)` and log p(s | c) in nats, `(B,)`."""
 
 
 class BeliefHead(Configurable, nn.Module, ABC):
-    r"""A conditional density :math:`p(s \mid c)` over the state given a context (DESIGN §4).
+    r"""A conditional density :math:`p(s \mid c)` over the state given a context.
 
-    The context is the hidden layer of the network that reads the history: shape `(*, C)`. A family knows neither the
-    world model nor the likelihood. To add one, copy `gaussian.py` and write `rsample` and `log_prob`.
+    The context is the last hidden layer of the network that reads the history, shape `(*, C)`. A family knows neither
+    the world model nor the likelihood. To add one, copy `gaussian.py` and write `rsample` and `log_prob`.
 
     Args:
         state_dim: D, the dimension of s.
@@ -27,7 +28,7 @@ class BeliefHead(Configurable, nn.Module, ABC):
     """
 
     reparameterised: ClassVar[bool] = True
-    """Whether the gradient of a draw is that of a differentiable path from c to s."""
+    """Whether a sample is a differentiable function of c, whose derivative is its gradient."""
 
     def __init__(self, state_dim: int, context_dim: int) -> None:
         super().__init__()
@@ -36,11 +37,11 @@ class BeliefHead(Configurable, nn.Module, ABC):
 
     @abstractmethod
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-        """Draw s, reparameterised, and its own log-density.
+        """Return reparameterised samples s and their log-density.
 
         Args:
             context: c, shape `(*, C)`.
-            sample_shape: how many independent draws per context.
+            sample_shape: shape of the independent samples per context.
 
         Returns:
             s, shape `(*sample_shape, *, D)`, and log p(s | c) in nats, shape `(*sample_shape, *)`.
@@ -48,27 +49,27 @@ class BeliefHead(Configurable, nn.Module, ABC):
 
     @abstractmethod
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
-        """Return log p(s | c) in nats, summed over the state: `(*, D)` and `(*, C)`, which broadcast, to `(*)`."""
+        """Return log p(s | c) in nats, `(*)`, for a state `(*, D)` and a context `(*, C)`, which broadcast."""
 
     def path_log_prob(self, state: Tensor, context: Tensor) -> Tensor:
-        r"""Return log p(s | c) as a function of s alone: neither the parameters nor the context have a gradient.
+        r"""Return log p(s | c) as a function of s alone: parameters and context receive no gradient.
 
-        At a draw :math:`s = g(\epsilon; c, \theta)` the rest of the gradient, :math:`\partial_\theta \log p_\theta(s)`
-        with s fixed, has mean 0 and only adds variance (Roeder et al., 2017, arXiv 1703.09194; for flows Vaitl et al.,
-        2022, arXiv 2207.08219). Shapes as of `log_prob`.
+        At a sample :math:`s = g(\epsilon; c, \theta)` the rest of the gradient,
+        :math:`\partial_\theta \log p_\theta(s)` with s fixed, has mean 0 and only adds variance (Roeder et al., 2017,
+        arXiv 1703.09194; for flows Vaitl et al., 2022, arXiv 2207.08219). Shapes are those of `log_prob`.
         """
         with frozen(self):
             return self.log_prob(state, context.detach())
 
     def sampler(self, loop: TimeLoop) -> Sampler:
-        """Prepare `rsample` for a time loop: what does not depend on the context is computed once, here.
+        """Return the function that samples in every step of a loop: the same as `rsample`, which it is by default.
 
-        A family may bind its weights to the loop (see `forbes.performance.time_loop`); the default does not.
+        A family that is faster when it is prepared for a loop, as a flow is, overrides it (`forbes.performance`).
         """
         return self.rsample
 
     def kl(self, context: Tensor, prior: "BeliefHead", prior_context: Tensor) -> Tensor | None:
-        """Return KL(p(· | c) ‖ prior(· | prior_context)) in nats, `(*)`, where a closed form exists, else None."""
+        """Return KL(p(· | c) ‖ prior(· | prior_context)) in nats, `(*)`; None if it has no closed form."""
         return None
 
 

@@ -3,30 +3,29 @@
 import torch
 from torch import Tensor, nn
 
-from forbes.beliefs.base import BeliefHead, Sampler
+from forbes.beliefs.base import BeliefHead
 from forbes.errors import ForbesError
-from forbes.performance.time_loop import TimeLoop
 
 __all__ = ["CategoricalBelief", "draw_one_hot", "one_hot_of"]
 
 
 class CategoricalBelief(BeliefHead):
-    r"""G independent one-hot variables of K classes each: s is their concatenation, of dimension D = G K.
+    r"""G independent one-hot variables of K classes each; s is their concatenation, of dimension D = G K.
 
     .. math:: p(s \mid c) = \prod_{g=1}^G \prod_{k=1}^K \pi_{gk}(c)^{s_{gk}}, \qquad \pi_g = \mathrm{softmax}(\cdot)
 
-    A probability, not a density. Gradients are straight-through, :math:`\partial s := \partial \pi` (DreamerV2,
-    algorithm 1): exact for the mean of what is linear in each variable, as log p is, and biased elsewhere.
+    This is a probability, not a density. Gradients are straight-through, :math:`\partial s := \partial \pi` (DreamerV2,
+    algorithm 1). They are unbiased for functions that are linear in each variable, such as log p, and biased otherwise.
 
     Args:
-        state_dim: D, a multiple of `classes`; DreamerV2 has 1024.
-        context_dim: C.
+        state_dim: D, a multiple of `classes`; 1024 in DreamerV2.
+        context_dim: C, the dimension of the context.
         classes: K; 32 as in DreamerV2.
-        kl_balance: :math:`\alpha` in [0, 1], how much of the closed form's gradient trains the prior; 0.8 in
-            DreamerV2. By default each side has its own whole gradient.
+        kl_balance: :math:`\alpha` in [0, 1], weight of the prior's gradient in the closed-form KL; 0.8 in DreamerV2. By
+            default, prior and posterior both receive their full gradient.
 
     Raises:
-        ForbesError: when `state_dim` is no multiple of `classes`, or `kl_balance` is outside [0, 1].
+        ForbesError: when `state_dim` is not a multiple of `classes`, or `kl_balance` is outside [0, 1].
 
     Example:
         >>> belief = forbes.CategoricalBelief(state_dim=2, context_dim=8, classes=2)
@@ -48,28 +47,24 @@ class CategoricalBelief(BeliefHead):
 
     def log_probabilities(self, context: Tensor) -> Tensor:
         """Return log π, `(*, G, K)`."""
-        return self._log_probabilities(self.logits_of(context))
+        variables: Tensor = self.logits_of(context).unflatten(-1, (-1, self.classes))  # (*, G, K)
+        return variables.log_softmax(-1)
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """See `BeliefHead.rsample`; the gradient is straight-through."""
         return draw_one_hot(self.log_probabilities(context), sample_shape)
 
-    def sampler(self, loop: TimeLoop) -> Sampler:
-        """See `BeliefHead.sampler`."""
-        logits_of = loop.affine(self.logits_of.weight, self.logits_of.bias)
-        return lambda context: draw_one_hot(self._log_probabilities(logits_of(context)))
-
     def log_prob(self, state: Tensor, context: Tensor) -> Tensor:
-        """See `BeliefHead.log_prob`; of one-hot states."""
+        """See `BeliefHead.log_prob`; the states are one-hot."""
         return (state * self.log_probabilities(context).flatten(-2)).sum(-1)
 
     def kl(self, context: Tensor, prior: BeliefHead, prior_context: Tensor) -> Tensor | None:
-        r"""See `BeliefHead.kl`; the closed form exists between two of the same classes.
+        r"""See `BeliefHead.kl`; the closed form exists if both are categorical with the same number of classes.
 
         .. math:: \sum_{g,k} \pi_{gk} (\log \pi_{gk} - \log \pi^{prior}_{gk})
 
-        With `kl_balance` it has the gradient of :math:`\alpha\, KL(\mathrm{sg}(q) \| p) +
-        (1 - \alpha)\, KL(q \| \mathrm{sg}(p))` (DreamerV2, algorithm 2), and the same value.
+        With `kl_balance` its gradient is that of :math:`\alpha\, KL(\mathrm{sg}(q) \| p) +
+        (1 - \alpha)\, KL(q \| \mathrm{sg}(p))` (DreamerV2, algorithm 2); its value is unchanged.
         """
         if not isinstance(prior, CategoricalBelief) or prior.classes != self.classes:
             return None
@@ -78,32 +73,29 @@ class CategoricalBelief(BeliefHead):
             ours, theirs = _scale_gradient(ours, 1 - self.kl_balance), _scale_gradient(theirs, self.kl_balance)
         return (ours.exp() * (ours - theirs)).sum((-2, -1))
 
-    def _log_probabilities(self, logits: Tensor) -> Tensor:
-        variables: Tensor = logits.unflatten(-1, (-1, self.classes))  # (*, G, K)
-        return variables.log_softmax(-1)
-
 
 def one_hot_of(index: Tensor, like: Tensor) -> Tensor:
-    """Return rows of 0 with a 1 at the index, `(*, 1)`, shaped and typed as `like`; `one_hot` reads the values."""
+    """Return one-hot rows like `like`, `(*, K)`, of an index, `(*, 1)`; unlike `one_hot`, without reading values."""
     return torch.zeros_like(like).scatter(-1, index, 1.0)
 
 
-def _scale_gradient(x: Tensor, share: float) -> Tensor:
-    """Return x, with so much of its gradient."""
-    return torch.lerp(x.detach(), x, share)
+def _scale_gradient(x: Tensor, factor: float) -> Tensor:
+    """Return x with its gradient scaled by a factor."""
+    return torch.lerp(x.detach(), x, factor)
 
 
 def draw_one_hot(log_probability: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-    """Draw one-hot variables, with straight-through gradients, and the log-probability of all of a row in nats.
+    """Sample one-hot variables with straight-through gradients.
 
     Args:
         log_probability: log π, `(*, G, K)`.
-        sample_shape: of independent draws.
+        sample_shape: shape of the independent samples.
 
     Returns:
-        The variables side by side, `(*sample_shape, *, G K)`, and `(*sample_shape, *)`.
+        The concatenated variables, `(*sample_shape, *, G K)`, and their joint log-probability in nats,
+        `(*sample_shape, *)`.
     """
-    # The largest of log π - log E, E exponential, is at k with probability π_k: no call that waits for the device.
+    # The argmax of log π - log E, E ~ Exp(1), is k with probability π_k. No call here waits for the device.
     shape = (*sample_shape, *log_probability.shape)  # (*sample_shape, *, G, K)
     race = log_probability.new_empty(shape).exponential_().log()
     drawn = one_hot_of((log_probability.detach() - race).argmax(-1, keepdim=True), race)  # (*sample_shape, *, G, K)

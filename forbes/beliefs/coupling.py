@@ -1,29 +1,27 @@
 """Conditional normalizing flows: coupling layers with LU-linear layers between them (paper §2.2 and appendix).
 
-The affine coupling here is the paper's; `splines.py` has another. One direction generates (base noise to state), the
-other evaluates (`inverse`); both cost the same.
+The affine coupling here is the paper's; `splines.py` has another. `forward` maps base noise to a state,
+`inverse` a state to its noise; both cost the same. `forbes.performance.flow_loop` has a faster form for time loops.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, pad, softplus
 
 from forbes.errors import ForbesError
-from forbes.performance.fusion import Elementwise, fused, keep
-from forbes.performance.time_loop import Bind, bind_now
+from forbes.performance.flow_loop import CouplingLayers, FlowStep, affine_layers, prepare_flow
+from forbes.performance.time_loop import TimeLoop
 
-__all__ = ["AffineCoupling", "ConditionalFlow", "Coupling", "CouplingFamily", "FlowMap", "LULinear"]
+__all__ = ["AffineCoupling", "ConditionalFlow", "Coupling", "CouplingFamily", "LULinear", "join", "split"]
 
 LOG_SCALE_BOUND = 2.0
 """|ℓ| stays below this in each layer: a plain exp explodes (nflows issue 49), a sigmoid could only contract."""
 
-FlowMap: TypeAlias = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""(x, context) to (y, log|det|)."""
 CouplingFamily: TypeAlias = Callable[[int, int, bool], "Coupling"]
 """Builds a coupling layer from (dim, width, swap): a class with its other arguments bound."""
 
@@ -40,6 +38,14 @@ class LULinear(nn.Module):
         self.factors = nn.Parameter(torch.zeros(dim, dim))
         self.raw_diagonal = nn.Parameter(torch.full((dim,), math.log(math.expm1(1 - 1e-3))))
         self.bias = nn.Parameter(torch.zeros(dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return y, `(*, D)`."""
+        return linear(x, self.matrix(), self.bias)
+
+    def inverse(self, y: Tensor) -> Tensor:
+        """Return x, `(*, D)`."""
+        return linear(y - self.bias, self.inverse_matrix())
 
     def triangles(self) -> tuple[Tensor, Tensor]:
         """Return L and U, each `(D, D)`."""
@@ -66,15 +72,14 @@ class LULinear(nn.Module):
 
 
 class Coupling(nn.Module, ABC):
-    r"""One part of x moves, elementwise and increasing, as the rest says: :math:`y_a = x_a,\ y_b = g(x_b; NN(x_a, c))`.
+    r"""One part of x is kept, the other transformed given it: :math:`y_a = x_a,\ y_b = g(x_b; NN(x_a, c))`.
 
-    The network is the paper's: a linear layer, one residual block of two linear layers, and a last linear layer, which
-    each kind of coupling has for itself. The context's share of the first layer arrives ready made (`ConditionalFlow`
-    computes it for all layers in one matmul). To have nothing to cut, the first layer reads all of x with zero weights
-    for x_b.
+    g is elementwise and increasing. The network is the paper's: a linear layer, one residual block of two linear
+    layers, and a last layer, which each kind of coupling defines. The first layer's term of the context is an argument,
+    since `ConditionalFlow` computes it for all couplings in one product.
 
     Args:
-        dim: D; if it is 1, all of x moves and the network reads the context only.
+        dim: D; if it is 1, all of x is transformed and the network reads the context only.
         width: W of the network.
         swap: False transforms the second part given the first, True the first given the second.
     """
@@ -87,62 +92,60 @@ class Coupling(nn.Module, ABC):
         self.inner, self.outer = nn.Linear(width, width), nn.Linear(width, width)
 
     @abstractmethod
-    def generator(self, bind: Bind, mixing: LULinear | None = None) -> FlowMap:
-        """Prepare (x, share) -> (y, log-slopes): `(*, D)` and `(*, W)` to `(*, D)` and what sums to log|det ∂y/∂x|.
+    def forward(self, x: Tensor, context_term: Tensor) -> tuple[Tensor, Tensor]:
+        """Return y, `(*, D)`, and the log-slopes log ∂y_b/∂x_b, whose sum is log|det ∂y/∂x|.
 
-        With `mixing`, y is of the x that this layer makes first.
+        Args:
+            x: shape `(*, D)`.
+            context_term: what the first layer adds for the context, `(*, W)`.
         """
 
     @abstractmethod
-    def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x, `(*, D)`, and the forward log-slopes at it."""
+    def inverse(self, y: Tensor, context_term: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x, `(*, D)`, and the log-slopes of `forward` at it."""
 
-    def network(
-        self, bind: Bind, weight: Tensor, bias: Tensor, then: Elementwise, mixing: LULinear | None = None, *more: Any
-    ) -> FlowMap:
-        r"""Prepare (x, share) -> then(NN, x, ...), where NN ends in the layer with this weight and bias.
+    @abstractmethod
+    def layers(self) -> CouplingLayers:
+        """Return the layers for a time loop (`forbes.performance.flow_loop`)."""
 
-        Layers with nothing elementwise between them are one product each time: what mixes x and the first layer, and
-        the block's second layer O, added to its input u, and the last layer L:
+    def hidden(self, x_a: Tensor, context_term: Tensor) -> Tensor:
+        """Return what the last layer of NN(x_a, c) reads, `(*, W)`."""
+        u = context_term if self.first is None else self.first(x_a) + context_term
+        block: Tensor = self.outer(self.inner(u.relu()).relu())  # (*, W)
+        return u + block
 
-        .. math:: L (u + O v) = [L, L O]\,[u, v]
-        """
-        enter = self._entrance(bind, mixing)
-        inner = bind(self.inner.weight, self.inner.bias, _extend)
-        both = torch.cat((weight, weight @ self.outer.weight), 1)  # (out, 2 W)
-        last = bind(both, bias + weight @ self.outer.bias, then)
-
-        def run(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-            x, hidden, active = enter(x, share)
-            moved: tuple[Tensor, Tensor] = last(inner(active, hidden), x, *more)
-            return moved
-
-        return run
-
-    def _entrance(self, bind: Bind, mixing: LULinear | None) -> Callable[[Tensor, Tensor], tuple[Tensor, ...]]:
-        """Prepare (x, share) -> x, mixed, the first layer's output, and its ReLU: `(*, D)`, `(*, W)`, `(*, W)`."""
+    def wide_first(self) -> Tensor | None:
+        """Return the first layer's weight with zeros for x_b, `(W, D)`."""
         if self.first is None:
-            mix = bind(mixing.matrix(), mixing.bias) if mixing else keep
-            return lambda x, share: (mix(x), share, share.relu())
-        weight = pad(self.first.weight, (self.other, 0) if self.swap else (0, self.other))  # (W, D)
-        if mixing is None:
-            first = bind(weight, weight.new_zeros(len(weight)), _join)
-            return lambda x, share: (x, *first(x, share))
-        matrix = mixing.matrix()
-        rows = torch.cat((matrix, weight @ matrix))  # (D + W, D)
-        return bind(rows, torch.cat((mixing.bias, weight @ mixing.bias)), _split_and_join)
+            return None
+        return pad(self.first.weight, (self.other, 0) if self.swap else (0, self.other))
+
+
+def split(x: Tensor, given: int, swap: bool) -> tuple[Tensor, Tensor]:
+    """Return x_a, `(*, given)`, and x_b of x, `(*, D)`."""
+    other = x.shape[-1] - given
+    if swap:
+        x_b, x_a = x.split((other, given), -1)
+    else:
+        x_a, x_b = x.split((given, other), -1)
+    return x_a, x_b
+
+
+def join(x_a: Tensor, x_b: Tensor, swap: bool) -> Tensor:
+    """Return x, `(*, D)`, of its parts."""
+    x_a = x_a.expand(*x_b.shape[:-1], -1)  # one x may meet many contexts
+    return torch.cat((x_b, x_a) if swap else (x_a, x_b), -1)
 
 
 class AffineCoupling(Coupling):
     r"""Affine coupling: :math:`y_a = x_a` and :math:`y_b = x_b \odot e^{\ell} + t`, :math:`(\ell, t) = NN(x_a, c)`.
 
-    :math:`\ell = 2 \tanh(u/2)` is bounded. The last layer starts at zero, so the flow starts as the identity. To have
-    nothing to join, it writes all of :math:`(\ell, t)` with zeros for x_a.
+    :math:`\ell = 2 \tanh(u/2)` is bounded. The layers of u and t start at zero, so the flow starts as the identity.
 
     Args:
         dim: D, at least 2.
-        width: as of any `Coupling`.
-        swap: likewise.
+        width: W of the network.
+        swap: False transforms the second part given the first, True the first given the second.
 
     Raises:
         ForbesError: when `dim` is below 2.
@@ -157,31 +160,39 @@ class AffineCoupling(Coupling):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
-    def generator(self, bind: Bind, mixing: LULinear | None = None) -> FlowMap:
-        """See `Coupling.generator`; the log-slopes are `(*, D)`."""
-        return self.network(bind, *self._last(), _move, mixing)
+    def forward(self, x: Tensor, context_term: Tensor) -> tuple[Tensor, Tensor]:
+        """See `Coupling.forward`."""
+        x_a, x_b = split(x, self.given, self.swap)
+        log_scale, shift = self._network(x_a, context_term)
+        return join(x_a, x_b * log_scale.exp() + shift, self.swap), log_scale
 
-    def inverse(self, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+    def inverse(self, y: Tensor, context_term: Tensor) -> tuple[Tensor, Tensor]:
         """See `Coupling.inverse`."""
-        return self.network(bind_now, *self._last(), _move_back)(y, share)
+        y_a, y_b = split(y, self.given, self.swap)
+        log_scale, shift = self._network(y_a, context_term)
+        return join(y_a, (y_b - shift) * (-log_scale).exp(), self.swap), log_scale
 
-    def _last(self) -> tuple[Tensor, Tensor]:
-        """Return weight and bias of the layer that writes (u/2, t), zeros for x_a: `(2 D, W)` and `(2 D,)`."""
-        around = (0, self.given) if self.swap else (self.given, 0)
-        rows = (0, 0, *around)
-        weight = torch.cat((pad(self.log_scale.weight / LOG_SCALE_BOUND, rows), pad(self.shift.weight, rows)))
-        bias = torch.cat((pad(self.log_scale.bias / LOG_SCALE_BOUND, around), pad(self.shift.bias, around)))
-        return weight, bias
+    def layers(self) -> CouplingLayers:
+        """See `Coupling.layers`."""
+        block = self.wide_first(), self.inner, self.outer
+        zeros = (0, self.given) if self.swap else (self.given, 0)
+        return affine_layers(*block, self.log_scale, self.shift, zeros, LOG_SCALE_BOUND)
+
+    def _network(self, x_a: Tensor, context_term: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (ℓ, t) = NN(x_a, c), `(*, other)` each."""
+        u = self.hidden(x_a, context_term)
+        log_scale = LOG_SCALE_BOUND * torch.tanh(self.log_scale(u) / LOG_SCALE_BOUND)
+        return log_scale, self.shift(u)
 
 
 class ConditionalFlow(nn.Module):
     r"""K coupling layers, an LU-linear layer between neighbours: :math:`f = f_K \circ \dots \circ f_1` given c.
 
     Args:
-        dim: D.
-        context_dim: C.
-        layers: K coupling layers; alternate parts are transformed.
-        width: W of each coupling network.
+        dim: D, the dimension of x.
+        context_dim: C, the dimension of the context.
+        layers: K, the number of coupling layers; they transform the two parts of x in turn.
+        width: W, the width of each coupling network.
         coupling: builds a layer from (dim, width, swap).
 
     Raises:
@@ -195,100 +206,47 @@ class ConditionalFlow(nn.Module):
         if layers < 1:
             raise ForbesError(f"ConditionalFlow: layers is {layers}, expected at least 1; use GaussianBelief for none")
         self.context = nn.Linear(context_dim, layers * width)
-        swaps = [dim > 1 and bool(k % 2) for k in range(layers)]  # one dimension has nothing to take turns with
+        swaps = [dim > 1 and bool(k % 2) for k in range(layers)]  # a single dimension has no second part
         self.couplings = nn.ModuleList(coupling(dim, width, swap) for swap in swaps)
         self.mixings = nn.ModuleList(LULinear(dim) for _ in range(layers - 1))
 
-    def generator(self, bind: Bind) -> FlowMap:
-        """Prepare (x, c) -> y = f(x; c), `(*, D)`, and log|det ∂y/∂x| in nats, `(*)`.
-
-        What no context changes is computed here, once.
-        """
-        of_context = bind(self.context.weight, self.context.bias)
-        couplings, lu_layers = self._layers()
-        steps = [
-            coupling.generator(bind, mixing) for coupling, mixing in zip(couplings, [None, *lu_layers], strict=True)
-        ]
-        constant = self._constant_log_det()
-
-        def generate(x: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
-            log_slopes = []
-            for step, share in zip(steps, of_context(context).chunk(len(steps), -1), strict=True):  # K x (*, W)
-                x, log_slope = step(x, share)
-                log_slopes.append(log_slope)
-            return x, _total(constant, *log_slopes)
-
-        return generate
-
     def forward(self, x: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
-        """Generate: y = f(x; c), shape `(*, D)`, and log|det ∂y/∂x| in nats, shape `(*)`."""
-        return self.generator(bind_now)(x, context)
+        """Return y = f(x; c), `(*, D)`, and log|det ∂y/∂x| in nats, `(*)`, for x `(*, D)` and c `(*, C)`."""
+        log_det = self._mixings_log_det()
+        for mixing, coupling, context_term in self._layers(context):
+            if mixing is not None:
+                x = mixing(x)
+            x, log_slope = coupling(x, context_term)  # (*, D), (*, other)
+            log_det = log_det + log_slope.sum(-1)
+        return x, log_det
 
     def inverse(self, y: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
-        """Evaluate: x = f⁻¹(y; c), shape `(*, D)`, and the forward log|det ∂y/∂x| at it in nats, shape `(*)`."""
-        couplings, lu_layers = self._layers()
-        shares = self.context(context).chunk(len(couplings), -1)  # K x (*, W)
-        log_slopes = []
-        for k in reversed(range(len(couplings))):
-            y, log_slope = couplings[k].inverse(y, shares[k])
-            log_slopes.append(log_slope)
-            if k > 0:
-                y = linear(y - lu_layers[k - 1].bias, lu_layers[k - 1].inverse_matrix())
-        return y, _total(self._constant_log_det(), *log_slopes)
+        """Return x = f⁻¹(y; c), `(*, D)`, and log|det ∂y/∂x| of the forward map at x in nats, `(*)`."""
+        log_det = self._mixings_log_det()
+        for mixing, coupling, context_term in reversed(self._layers(context)):
+            y, log_slope = coupling.inverse(y, context_term)  # (*, D), (*, other)
+            if mixing is not None:
+                y = mixing.inverse(y)
+            log_det = log_det + log_slope.sum(-1)
+        return y, log_det
 
-    def _layers(self) -> tuple[list[Coupling], list[LULinear]]:
-        return (
-            [layer for layer in self.couplings if isinstance(layer, Coupling)],
-            [layer for layer in self.mixings if isinstance(layer, LULinear)],
-        )
+    def prepare(self, loop: TimeLoop) -> FlowStep:
+        """Return `forward` for the steps of a loop: the same map with merged layers (`performance/flow_loop.py`)."""
+        couplings = [coupling.layers() for coupling in self._couplings()]
+        mixings = [(mixing.matrix(), mixing.bias) for mixing in self._mixings()]
+        return prepare_flow(loop, self.context, couplings, mixings, self._mixings_log_det())
 
-    def _constant_log_det(self) -> Tensor:
-        """Sum the LU layers' log-determinants, a scalar."""
-        return sum((layer.log_det() for layer in self._layers()[1]), start=self.context.bias.new_zeros(()))
+    def _layers(self, context: Tensor) -> list[tuple[LULinear | None, Coupling, Tensor]]:
+        """Return every coupling with the layer before it and its context term, `(*, W)`."""
+        context_terms = self.context(context).chunk(len(self.couplings), -1)  # K x (*, W)
+        return list(zip([None, *self._mixings()], self._couplings(), context_terms, strict=True))
 
+    def _couplings(self) -> list[Coupling]:
+        return [layer for layer in self.couplings if isinstance(layer, Coupling)]
 
-@fused
-def _join(of_x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-    """Add the shares of x and of the context; give the sum and its ReLU."""
-    hidden = of_x + share
-    return hidden, hidden.relu()
+    def _mixings(self) -> list[LULinear]:
+        return [layer for layer in self.mixings if isinstance(layer, LULinear)]
 
-
-@fused
-def _split_and_join(both: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return x from what is x and its share, `(*, D + W)`, then as `_join`."""
-    width = share.shape[-1]
-    x, of_x = both.split((both.shape[-1] - width, width), -1)  # (*, D), (*, W)
-    hidden = of_x + share
-    return x, hidden, hidden.relu()
-
-
-@fused
-def _extend(inner: Tensor, hidden: Tensor) -> Tensor:
-    """Return the block's input and what its second layer reads, side by side, `(*, 2 W)`."""
-    return torch.cat((hidden, inner.relu()), -1)
-
-
-@fused
-def _move(raw: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return y and ℓ from (u/2, t), `(*, 2 D)`, and x, `(*, D)`."""
-    log_scale, shift = _log_scale_and_shift(raw)
-    return torch.addcmul(shift, x, log_scale.exp()), log_scale
-
-
-@fused
-def _move_back(raw: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Return x and ℓ from y, likewise."""
-    log_scale, shift = _log_scale_and_shift(raw)
-    return (y - shift) * (-log_scale).exp(), log_scale
-
-
-def _log_scale_and_shift(raw: Tensor) -> tuple[Tensor, Tensor]:
-    half, shift = raw.chunk(2, -1)  # 2 x (*, D)
-    return LOG_SCALE_BOUND * half.tanh(), shift
-
-
-@fused
-def _total(constant: Tensor, *log_slopes: Tensor) -> Tensor:
-    """Add up log|det| from the layers' log-slopes, each `(*, D)`, to `(*)`."""
-    return torch.cat(log_slopes, -1).sum(-1) + constant
+    def _mixings_log_det(self) -> Tensor:
+        """Return the sum of the LU layers' log-determinants in nats, a scalar."""
+        return sum((mixing.log_det() for mixing in self._mixings()), start=self.context.bias.new_zeros(()))

@@ -21,16 +21,17 @@ class FlowBelief(BeliefHead):
     .. math:: s = f(s_0; c), \quad s_0 \sim N(\mu(c), \sigma(c)^2), \qquad
               \log p(s \mid c) = \log N(s_0; \mu, \sigma^2) - \log\left|\det \partial f / \partial s_0\right|
 
-    At initialisation f is the identity: the belief is exactly `GaussianBelief`.
+    At initialisation f is the identity, so the belief equals `GaussianBelief`.
 
     Args:
-        state_dim: D, at least 2 with affine couplings.
-        context_dim: C.
-        layers: K coupling layers; 5 for DeepMind Control, 3 for digit strokes (paper, appendix).
+        state_dim: D, the dimension of s; at least 2 with affine couplings.
+        context_dim: C, the dimension of the context.
+        layers: K, the number of coupling layers; 5 for DeepMind Control, 3 for digit strokes (paper, appendix).
         width: width of each coupling network; the paper does not give it.
-        min_std: smallest standard deviation of the base, the same as the Gaussian belief's.
-        coupling: "affine" is the paper's; "spline" also splits a one-dimensional state (Durkan et al., 2019).
-        bins: of each spline; 8 as in Durkan et al.
+        min_std: smallest standard deviation of the base, as for `GaussianBelief`.
+        coupling: "affine" is the paper's; "spline" can also split a one-dimensional state into several modes (Durkan et
+            al., 2019).
+        bins: number of bins per spline; 8 as in Durkan et al.
 
     Example:
         >>> belief = forbes.FlowBelief(state_dim=2, context_dim=8, layers=3)
@@ -67,12 +68,12 @@ class FlowBelief(BeliefHead):
         return self.base.log_prob(base, context) - log_det
 
     def sampler(self, loop: TimeLoop) -> Sampler:
-        """See `BeliefHead.sampler`."""
-        base, generate = self.base.sampler(loop), self.flow.generator(loop.affine)
+        """See `BeliefHead.sampler`: the flow's layers are merged for the loop."""
+        sample_base, generate = self.base.sampler(loop), self.flow.prepare(loop)
 
         def sample(context: Tensor) -> tuple[Tensor, Tensor]:
-            noise, log_prob = base(context)
-            state, log_det = generate(noise, context)
+            base, log_prob = sample_base(context)
+            state, log_det = generate(base, context)
             return state, log_prob - log_det
 
         return sample

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from forbes.beliefs.base import BeliefHead, Sampler
-from forbes.performance.time_loop import TimeLoop
+from forbes.beliefs.base import BeliefHead
 from forbes.shapes import printed_by_shape
 
 __all__ = ["Mixture", "MixtureBelief"]
@@ -37,21 +36,21 @@ class MixtureBelief(BeliefHead):
     .. math:: p(s \mid c) = \sum_{m=1}^M w_m(c) \prod_d N(s_d; \mu_{md}(c), \sigma_{md}(c)^2), \quad
               w = \mathrm{softmax}(\cdot), \ \sigma = \mathrm{softplus}(\cdot) + \sigma_{min}
 
-    A draw is that of a component, and its gradient the implicit one (Figurnov et al., 2018, arXiv 1805.08498) of
+    A sample is drawn from a component. Its gradient is the implicit one (Figurnov et al., 2018, arXiv 1805.08498) of
 
     .. math:: F_d(s_d \mid s_{<d}) = \sum_m r_{md}\, \Phi\!\left(\frac{s_d - \mu_{md}}{\sigma_{md}}\right),
               \qquad r_{md} \propto w_m \prod_{j<d} N(s_j; \mu_{mj}, \sigma_{mj}^2)
 
     :math:`\partial s / \partial\theta = -(\partial F / \partial s)^{-1}\, \partial F / \partial\theta` depends on s
-    alone, so it is the exact pathwise gradient however s was drawn, unbiased for weights, means and standard
-    deviations alike. Where modes lie far apart, the weights' share of it comes from the few draws between them, each
+    alone, so it is the exact pathwise gradient however s was drawn, and unbiased for weights, means and standard
+    deviations. If modes are far apart, the gradient of the weights comes from the few samples between them, each
     divided by the small density there.
 
     Args:
-        state_dim: D.
-        context_dim: C.
-        components: M.
-        min_std: smallest standard deviation, the same as the Gaussian belief's.
+        state_dim: D, the dimension of s.
+        context_dim: C, the dimension of the context.
+        components: M, the number of Gaussians.
+        min_std: smallest standard deviation, as for `GaussianBelief`.
 
     Example:
         >>> belief = forbes.MixtureBelief(state_dim=2, context_dim=8, components=3)
@@ -66,8 +65,11 @@ class MixtureBelief(BeliefHead):
         self.parameters_of = nn.Linear(context_dim, components * (1 + 2 * state_dim))
 
     def mixture(self, context: Tensor) -> Mixture:
-        """Return the mixture of a context."""
-        return self._mixture(self.parameters_of(context))
+        """Return p(s | c) for contexts `(*, C)`."""
+        size, shape = self.components * self.state_dim, (self.components, self.state_dim)
+        logits, mean, raw_std = self.parameters_of(context).split((self.components, size, size), -1)
+        std = softplus(raw_std.unflatten(-1, shape)) + self.min_std  # (*, M, D)
+        return Mixture(logits.log_softmax(-1), mean.unflatten(-1, shape), std)  # (*, M), (*, M, D), (*, M, D)
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """See `BeliefHead.rsample`."""
@@ -77,25 +79,14 @@ class MixtureBelief(BeliefHead):
         """See `BeliefHead.log_prob`."""
         return self.mixture(context).log_prob(state)
 
-    def sampler(self, loop: TimeLoop) -> Sampler:
-        """See `BeliefHead.sampler`."""
-        parameters_of = loop.affine(self.parameters_of.weight, self.parameters_of.bias)
-        return lambda context: _draw(self._mixture(parameters_of(context)))
-
-    def _mixture(self, parameters: Tensor) -> Mixture:
-        size = self.components * self.state_dim
-        logits, mean, raw_std = parameters.split((self.components, size, size), -1)
-        shape = (self.components, self.state_dim)
-        std = softplus(raw_std.unflatten(-1, shape)) + self.min_std  # (*, M, D)
-        return Mixture(logits.log_softmax(-1), mean.unflatten(-1, shape), std)  # (*, M), (*, M, D), (*, M, D)
-
 
 def _standard_log_density(noise: Tensor) -> Tensor:
-    """Return log N(ε; 0, 1) of each number."""
+    """Return log N(ε; 0, 1) elementwise."""
     return -0.5 * (noise.square() + math.log(2 * math.pi))
 
 
 def _draw(mixture: Mixture, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+    """Return samples, `(*sample_shape, *, D)`, and their log-density in nats, `(*sample_shape, *)`."""
     with torch.no_grad():
         log_weight = mixture.log_weight.expand(*sample_shape, *mixture.log_weight.shape)  # (*sample_shape, *, M)
         gumbel = -torch.rand_like(log_weight).log().neg().log()  # (*sample_shape, *, M)
@@ -110,7 +101,7 @@ def _draw(mixture: Mixture, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor,
 
 
 def _reparameterised(mixture: Mixture, state: Tensor) -> Tensor:
-    r"""Return the same numbers with the gradient :math:`-J^{-1}\, \partial F / \partial\theta`, J lower triangular.
+    r"""Return the same state with the gradient :math:`-J^{-1}\, \partial F / \partial\theta`, J lower triangular.
 
     .. math:: J_{dj} = \frac{\partial F_d}{\partial s_j} = -\sum_m r_{md} (\Phi_{md} - F_d) \frac{s_j - \mu_{mj}}
               {\sigma_{mj}^2} \ (j < d), \qquad J_{dd} = p(s_d \mid s_{<d})
@@ -118,20 +109,20 @@ def _reparameterised(mixture: Mixture, state: Tensor) -> Tensor:
     noise_of = (state.unsqueeze(-2) - mixture.mean) / mixture.std  # (*, M, D)
     log_density = _standard_log_density(noise_of) - mixture.std.log()  # (*, M, D)
     log_weight = mixture.log_weight.expand(log_density.shape[:-1]).unsqueeze(-1)  # (*, M, 1)
-    share = torch.cat((log_weight, log_density[..., :-1]), -1).cumsum(-1).softmax(-2)  # (*, M, D)
+    responsibility = torch.cat((log_weight, log_density[..., :-1]), -1).cumsum(-1).softmax(-2)  # r, (*, M, D)
     with torch.no_grad():
-        above = (share * torch.erfc(noise_of / math.sqrt(2))).sum(-2, keepdim=True) < 1  # the median, (*, 1, D)
+        above = (responsibility * torch.erfc(noise_of / math.sqrt(2))).sum(-2, keepdim=True) < 1  # F > 1/2, (*, 1, D)
         side = torch.where(above, 1.0, -1.0).to(state.dtype)  # (*, 1, D)
-    # The smaller tail keeps its precision, as a function that rises: Φ below the median, else Φ - 1.
+    # F is taken from its smaller tail, which keeps the precision: Φ below the median, Φ - 1 above it.
     tails = -0.5 * side * torch.erfc(side * noise_of / math.sqrt(2))  # (*, M, D)
-    tail = (share * tails).sum(-2)  # (*, D)
+    cdf_tail = (responsibility * tails).sum(-2)  # F or F - 1, (*, D)
     with torch.no_grad():
-        density = (share * log_density.exp()).sum(-2)  # (*, D)
-        # Where rounding of F hides where in a gap between modes the draw lies, its gradient is bounded.
+        density = (responsibility * log_density.exp()).sum(-2)  # (*, D)
+        # In a gap between modes, F is constant up to rounding; the floor bounds the gradient there.
         density = density.clamp(min=torch.finfo(density.dtype).eps)
-        below = (share * (tails - tail.unsqueeze(-2))).mT @ (-noise_of / mixture.std)  # (*, D, D)
+        below = (responsibility * (tails - cdf_tail.unsqueeze(-2))).mT @ (-noise_of / mixture.std)  # (*, D, D)
         jacobian = below.tril(-1) + density.diag_embed()  # (*, D, D)
     change: Tensor = torch.linalg.solve_triangular(
-        jacobian, (tail - tail.detach()).unsqueeze(-1), upper=False
+        jacobian, (cdf_tail - cdf_tail.detach()).unsqueeze(-1), upper=False
     )  # (*, D, 1)
     return state - change.squeeze(-1)

@@ -1,17 +1,17 @@
-"""Networks of the world model: perceptrons, image encoders and decoders (paper, appendix: Dreamer's)."""
+"""Networks of the world model: MLPs, image encoders and decoders (paper, appendix: Dreamer's)."""
 
 import math
 from collections.abc import Callable
 from itertools import chain, pairwise
 from typing import Literal, TypeAlias
 
-import torch
 from torch import Tensor, nn
 from torch.nn.functional import elu, relu
 
 from forbes.configured import Configurable
 from forbes.errors import ForbesError
-from forbes.performance.fusion import Elementwise, fused
+from forbes.performance.fusion import Elementwise
+from forbes.performance.recurrence import prepare_mlp
 from forbes.performance.time_loop import TimeLoop
 
 __all__ = [
@@ -23,7 +23,6 @@ __all__ = [
     "MLPDecoder",
     "MLPEncoder",
     "activate",
-    "bind_gru",
     "transposed_kernels",
 ]
 
@@ -31,11 +30,11 @@ Activation: TypeAlias = Literal["relu", "elu"]
 _ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU}
 _FUNCTIONS: dict[type[nn.Module], Elementwise] = {nn.ReLU: relu, nn.ELU: elu}
 _KERNEL = 4
-"""Of the encoder's convolutions, pixels a side."""
+"""Side of the encoder's kernels in pixels."""
 
 
 class MLP(nn.Sequential):
-    """`layers` linear layers of `width`, each followed by the activation: a ReLU, until `activate` says otherwise."""
+    """`layers` linear layers of `width`, each followed by an activation: ReLU, unless `activate` replaces it."""
 
     def __init__(self, input_dim: int, width: int, layers: int) -> None:
         dims = [input_dim] + [width] * layers
@@ -48,37 +47,20 @@ class MLP(nn.Sequential):
 
     @property
     def activation(self) -> Elementwise:
-        """What follows each of them."""
+        """The function that follows each of them."""
         return _FUNCTIONS[type(self.get_submodule("0.1"))]
+
+    def prepare(self, known: Tensor, loop: TimeLoop) -> Callable[[Tensor], Tensor]:
+        """Return the network of [x, known] as a function of x, for the steps of a loop (see `prepare_mlp`)."""
+        return prepare_mlp(self.linear, self.activation, known, loop)
 
 
 def activate(module: nn.Module, activation: Activation) -> None:
-    """Replace the activation of every perceptron of a module."""
+    """Replace the activation of every MLP of a module."""
     for part in module.modules():
         if isinstance(part, MLP):
             for block in part.children():
                 block.add_module("1", _ACTIVATIONS[activation]())
-
-
-def bind_gru(cell: nn.GRUCell, loop: TimeLoop) -> Callable[[Tensor, Tensor], Tensor]:
-    r"""Bind a GRU cell to a loop: (x, h) to the next h, `(B, H)`; the same numbers as `cell(x, h)`.
-
-    .. math:: r, z = \sigma(W_{ir} x + W_{hr} h), \sigma(W_{iz} x + W_{hz} h), \quad
-              n = \tanh(W_{in} x + r \odot W_{hn} h), \quad h' = n + z \odot (h - n)
-    """
-    of_input = loop.affine(cell.weight_ih, cell.bias_ih)
-    of_hidden = loop.affine(cell.weight_hh, cell.bias_hh, _gate)
-    return lambda x, hidden: of_hidden(hidden, of_input(x), hidden)
-
-
-@fused
-def _gate(of_hidden: Tensor, of_x: Tensor, hidden: Tensor) -> Tensor:
-    """Return the next h of a GRU, `(B, H)`, from the shares of h and x, `(B, 3 H)`."""
-    sizes = [2 * hidden.shape[-1], hidden.shape[-1]]
-    gates_x, new_x = of_x.split(sizes, -1)  # (B, 2 H), (B, H)
-    gates_h, new_h = of_hidden.split(sizes, -1)  # (B, 2 H), (B, H)
-    reset, update = (gates_x + gates_h).sigmoid().chunk(2, -1)  # 2 x (B, H)
-    return torch.lerp(torch.addcmul(new_x, reset, new_h).tanh(), hidden, update)
 
 
 class Encoder(Configurable, nn.Module):
@@ -102,12 +84,12 @@ DecoderFamily: TypeAlias = Callable[[int, tuple[int, ...]], Decoder]
 
 
 class MLPEncoder(Encoder):
-    """Perceptron on vectors or flattened pixels: by far the cheapest encoder of small frames on a CPU.
+    """MLP on vectors or flattened pixels: by far the cheapest encoder of small frames on a CPU.
 
     Args:
         observation_shape: (C, H, W), or (O,).
         width: width of each layer, and E.
-        layers: how many.
+        layers: number of layers.
 
     Example:
         >>> encoder = forbes.MLPEncoder((3,), width=16)
@@ -127,14 +109,14 @@ class MLPEncoder(Encoder):
 
 
 class MLPDecoder(Decoder):
-    """Perceptron to vectors or pixels.
+    """MLP to vectors or pixels.
 
     Args:
         feature_dim: F.
         observation_shape: (C, H, W), or (O,).
         width: width of each hidden layer.
-        layers: how many hidden layers.
-        output_bias: the output it starts from. The mean pixel, for strokes a logit of -4 or a value of -0.48, saves
+        layers: number of hidden layers.
+        output_bias: initial output. The mean pixel, for strokes a logit of -4 or a value of -0.48, saves
             the first thousand updates of learning that most pixels are off, in which a posterior can collapse.
 
     Example:
@@ -191,7 +173,7 @@ class ConvEncoder(Encoder):
 
     Args:
         observation_shape: (C, H, W), at least 4 pixels a side.
-        channels: of the first layer; each further layer has twice as many.
+        channels: channels of the first layer; each further layer has twice as many.
 
     Raises:
         ForbesError: for vectors, or smaller images.
@@ -228,8 +210,8 @@ class ConvDecoder(Decoder):
     Args:
         feature_dim: F.
         observation_shape: (C, H, W), at least 4 pixels a side.
-        channels: of the last hidden layer; each layer before has twice as many.
-        output_bias: the output it starts from, see `MLPDecoder`.
+        channels: channels of the last hidden layer; each layer before has twice as many.
+        output_bias: initial output, see `MLPDecoder`.
 
     Raises:
         ForbesError: for vectors, or smaller images.

@@ -5,24 +5,27 @@ r"""The recurrent state-space model: filter a sequence, imagine its future, deco
     y_t = \mathrm{MLP}(s_{t-1}, a_{t-1}), \quad h_t = \mathrm{GRU}(h_{t-1}, y_t), \quad (h_0, s_0) = 0 \\
     \text{prior } p(s_t \mid h_t), \qquad \text{posterior } q(s_t \mid h_t, e_t), \quad e_t = \mathrm{encoder}(o_t)
 
-Only the posterior's sample feeds the recurrence. So the time loop holds the transition, the GRU and the posterior;
-the encoder runs before it, the prior and the decoder after it, once over (B·T).
+`StateSpaceModel.step` is this definition for one step. Only the posterior's sample feeds the recurrence, so the time
+loop holds the transition, the GRU and the posterior. The encoder runs before the loop, the prior and the decoder after
+it, once over (B·T).
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import linear, softplus
+from torch.nn.functional import softplus
 
 from forbes.beliefs import BeliefHead
 from forbes.errors import require_at_least
 from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.networks import MLP, bind_gru
+from forbes.models.networks import MLP
 from forbes.performance.precision import full_precision
-from forbes.performance.time_loop import Affine, TimeLoop
+from forbes.performance.recurrence import prepare_gru
+from forbes.performance.time_loop import TimeLoop
 from forbes.shapes import printed_by_shape
 
 __all__ = ["Filtered", "StateSpaceModel"]
@@ -30,7 +33,7 @@ __all__ = ["Filtered", "StateSpaceModel"]
 
 @printed_by_shape
 class Filtered(NamedTuple):
-    """A trajectory of the posterior, with what the bound and further samples need; one step of it has no T."""
+    """A trajectory of the posterior, and what the bound and further samples need; a single step has no T."""
 
     hidden: Tensor
     """h_t, `(B, T, H)`."""
@@ -47,7 +50,7 @@ class Filtered(NamedTuple):
         return torch.cat((self.hidden, self.state), -1)  # (B, T, H + D)
 
     def at(self, time: int) -> State:
-        """Return the state at one step, to go on from."""
+        """Return (h, s) at one step, from which the filter can continue."""
         return State(self.hidden[:, time], self.state[:, time])  # (B, H), (B, D)
 
 
@@ -86,28 +89,46 @@ class StateSpaceModel(BeliefModel):
         weight = self.gru.weight_hh
         return State(weight.new_zeros(batch, self.hidden_dim), weight.new_zeros(batch, self.state_dim))
 
+    def step(self, before: State, embedding: Tensor, action: Tensor) -> Filtered:
+        r"""Filter one step: move (h, s) by the action that was taken, then correct s by what was observed.
+
+        .. math:: h_t = \mathrm{GRU}(h_{t-1}, \mathrm{MLP}(s_{t-1}, a_{t-1})), \quad
+                  c_t = \mathrm{MLP}(h_t, e_t), \quad s_t \sim q(s_t \mid c_t)
+
+        Args:
+            before: (h_{t-1}, s_{t-1}), `(B, ...)`.
+            embedding: e_t, `(B, E)`.
+            action: a_{t-1}, `(B, A)`.
+        """
+        hidden = self.gru(self.transition(torch.cat((before.state, action), -1)), before.hidden)  # (B, H)
+        context = self.posterior_context(torch.cat((hidden, embedding), -1))  # (B, C)
+        state, log_prob = self.posterior.rsample(context)  # (B, D), (B,)
+        return Filtered(hidden, state, context, log_prob)
+
     def prepare_step(self, embedding: Tensor, action: Tensor, copies: int = 1) -> Callable[[State], Filtered]:
-        """Prepare the filter for a loop over a sequence: what does not depend on the recurrence is computed here.
+        """Return `step` for a loop over a sequence: the same numbers, faster (`forbes.performance.time_loop`).
+
+        What does not depend on (h, s) is hoisted out of the loop: the terms of e_t and a_{t-1} in the first layers (one
+        product over all steps each), the weights that a flow merges, and the gradients of the weights.
 
         Args:
             embedding: e_t, `(B, T, E)`.
             action: a_{t-1}, the action that led to o_t, `(B, T, A)`.
-            copies: of each sequence that are filtered side by side, N.
+            copies: N, copies of each sequence that are filtered side by side.
 
         Returns:
-            One step, to be called T times: (h, s) before it to those after it, `(N B, ...)`, copy-major.
+            The step, to be called at most T times: (h, s) before it to those after it, `(N B, ...)`, copy-major.
         """
-        batch, time = embedding.shape[:2]
-        loop = TimeLoop(time, copies * batch)
-        transition = self._bind(self.transition, action, loop)
-        posterior_context = self._bind(self.posterior_context, embedding, loop)
-        gru = bind_gru(self.gru, loop)
+        loop = TimeLoop(steps=embedding.shape[1], batch=copies * len(embedding))
+        transition = self.transition.prepare(action, loop)
+        gru = prepare_gru(self.gru, loop)
+        posterior_context = self.posterior_context.prepare(embedding, loop)
         sample = self.posterior.sampler(loop)
 
         def step(before: State) -> Filtered:
-            hidden = gru(transition(before.state), before.hidden)
-            context = posterior_context(hidden)
-            state, log_prob = sample(context)
+            hidden = gru(transition(before.state), before.hidden)  # (N B, H)
+            context = posterior_context(hidden)  # (N B, C)
+            state, log_prob = sample(context)  # (N B, D), (N B,)
             return Filtered(hidden, state, context, log_prob)
 
         return step
@@ -118,16 +139,20 @@ class StateSpaceModel(BeliefModel):
         Args:
             embedding: e_t, `(B, T, E)`.
             action: a_{t-1}, the action that led to o_t, `(B, T, A)`.
-            start: where to go on from; (h_0, s_0) = 0 by default.
+            start: (h, s) before the first step; (h_0, s_0) = 0 by default.
 
         Returns:
-            One trajectory of (h_t, s_t) per sequence. A prefix of the input gives the prefix of the output (for
-            the same noise): nothing looks ahead.
+            One trajectory of (h_t, s_t) per sequence. It is causal: for the same noise, a prefix of the input gives the
+            prefix of the output.
         """
         state = start or self.initial(len(embedding))
+        step: Callable[[State], Filtered]
         steps: list[Filtered] = []
         with full_precision(embedding):
-            step = self.prepare_step(embedding, action)
+            if embedding.shape[1] == 1:  # as when an agent acts: there is nothing to hoist
+                step = partial(self.step, embedding=embedding[:, 0], action=action[:, 0])
+            else:
+                step = self.prepare_step(embedding, action)
             for _ in range(embedding.shape[1]):
                 steps.append(step(state))
                 state = State(steps[-1].hidden, steps[-1].state)
@@ -139,20 +164,20 @@ class StateSpaceModel(BeliefModel):
             return self.prior.log_prob(filtered.state, self.prior_context(filtered.hidden))
 
     def imagine(self, start: State, action: Tensor) -> Rollout:
-        """See `BeliefModel.imagine`: rolls the prior on."""
+        """See `BeliefModel.imagine`: a rollout of the prior."""
         given = iter(action.unbind(1))
         return self.rollout(start, lambda _: next(given), action.shape[1])
 
     def rollout(self, start: State, policy: Callable[[Tensor], Tensor], steps: int) -> Rollout:
-        """Roll the prior on from `start`, each row on its own trajectory and by its own actions.
+        """Roll out the prior from `start`, every row along its own trajectory and by its own actions.
 
         Args:
             start: (h, s), `(B, ...)`.
-            policy: the action in a state, from its features: `(B, H + D)` to `(B, A)`.
+            policy: features of a state, `(B, H + D)`, to the action taken in it, `(B, A)`.
             steps: T; the policy acts in `start` and in all steps but the last.
 
         Returns:
-            T steps after `start`, which itself is not among them.
+            The T steps after `start`, without `start` itself.
         """
         state, states, log_probs = start, [], []
         with full_precision(start.state):
@@ -181,7 +206,7 @@ class StateSpaceModel(BeliefModel):
         return step
 
     def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
-        """See `BeliefModel.sample_beliefs`: each from its own posterior trajectory, for h is random too."""
+        """See `BeliefModel.sample_beliefs`: every sample has its own posterior trajectory, since h is random too."""
         return self.filter(encoded.embedding.repeat(samples, 1, 1), encoded.action.repeat(samples, 1, 1)).at(
             -1
         )  # (N B, ...)
@@ -234,7 +259,7 @@ class StateSpaceModel(BeliefModel):
         return self.bound(self.filter(encoded.embedding, action), encoded, mask, kl)
 
     def bound(self, filtered: Filtered, encoded: EncodedSequence, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
-        """Estimate the bound with the posterior trajectory that `filter` has drawn for what was seen."""
+        """Estimate the bound with a posterior trajectory, which `filter` has drawn for this sequence."""
         reconstruction = self.log_likelihood(filtered.features, encoded.target)
         with full_precision(filtered.state):
             prior_context = self.prior_context(filtered.hidden)  # (B, T, C)
@@ -244,30 +269,6 @@ class StateSpaceModel(BeliefModel):
                 log_posterior = self.posterior.path_log_prob(filtered.state, filtered.context)  # (B, T)
             sampled = log_posterior - self.prior.log_prob(filtered.state, prior_context)  # (B, T)
         return ElboTerms(reconstruction, sampled, analytic, mask)
-
-    @staticmethod
-    def _bind(network: MLP, known: Tensor, loop: TimeLoop) -> Affine:
-        """Bind a perceptron of [x, known] to a loop over x; the share of what is known is one matmul over all steps.
-
-        Args:
-            network: of it.
-            known: the inputs that do not depend on the recurrence, `(B, T, K)`.
-            loop: to bind it to; its batch is N copies of these B sequences.
-        """
-        first, *others = network.linear
-        cut = first.in_features - known.shape[-1]
-        of_loop, of_known = first.weight[:, :cut], first.weight[:, cut:]  # (M, cut), (M, K)
-        share = linear(known.transpose(0, 1), of_known, first.bias)  # (T, B, M)
-        copies = share[:, None].expand(-1, loop.batch // len(known), -1, -1).flatten(1, 2)  # (T, N B, M)
-        layers = [loop.affine(of_loop, copies, network.activation)]
-        layers += [loop.affine(layer.weight, layer.bias, network.activation) for layer in others]
-
-        def run(x: Tensor) -> Tensor:
-            for layer in layers:
-                x = layer(x)
-            return x
-
-        return run
 
 
 def _log_share(log_p: Tensor, log_q: Tensor) -> Tensor:

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from forbes.errors import ForbesError, require_at_least
 from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.networks import bind_gru
 from forbes.performance.precision import full_precision
+from forbes.performance.recurrence import prepare_gru
 from forbes.performance.time_loop import TimeLoop
 
 __all__ = ["VectorModel"]
@@ -113,7 +113,7 @@ class VectorModel(BeliefModel):
         steps: list[Tensor] = []
         with full_precision(embedding):
             moves = self.transition(torch.cat((embedding, action), -1))  # (B, T, M)
-            gru = bind_gru(self.gru, TimeLoop(moves.shape[1], len(moves)))
+            gru = prepare_gru(self.gru, TimeLoop(moves.shape[1], len(moves)))
             for move in moves.unbind(1):
                 hidden = gru(move, hidden)
                 steps.append(hidden)

@@ -18,7 +18,8 @@ from small_models import (
 )
 
 from forbes.beliefs import GaussianBelief
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ModelParts, StateSpaceModel, elbo_loss
+from forbes.errors import ForbesError
+from forbes.models import Bernoulli, Filtered, MLPDecoder, MLPEncoder, ModelParts, State, StateSpaceModel, elbo_loss
 from forbes.models.networks import activate
 
 
@@ -41,6 +42,61 @@ def step_by_step(model, observation, action, kl="monte_carlo"):
         divergence.append(log_posterior - model.prior.log_prob(state, model.prior_context(hidden)))
         reconstruction.append(model.likelihood.log_prob(model.decoder(torch.cat((hidden, state), -1)), target))
     return torch.stack(reconstruction, 1), torch.stack(divergence, 1)
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+def test_the_prepared_steps_are_the_plain_steps(family, copies):
+    """Values, and gradients of every parameter, of embeddings and of actions."""
+    model, (observation, action, _) = random_model(family), sequences()
+    embedding = model.embed(observation).detach().requires_grad_()
+    action.requires_grad_()
+    wanted = {**dict(model.named_parameters()), "embedding": embedding, "action": action}
+    prepared = model.prepare_step(embedding, action, copies)
+    plain = (
+        partial(model.step, embedding=embedding[:, t].repeat(copies, 1), action=action[:, t].repeat(copies, 1))
+        for t in range(TIME)
+    )
+
+    results = []
+    for steps in ([prepared] * TIME, plain):
+        torch.manual_seed(0)
+        state, filtered = model.initial(copies * BATCH), []
+        for step in steps:
+            filtered.append(step(state))
+            state = State(filtered[-1].hidden, filtered[-1].state)
+        values = [torch.stack(parts) for parts in zip(*filtered, strict=True)]  # 4 x (T, N B, ...)
+        loss = sum((part.square().sum() for part in values), start=torch.zeros(()))
+        gradients = torch.autograd.grad(loss, list(wanted.values()), allow_unused=True)
+        results.append(dict(zip([*Filtered._fields, *wanted], [*values, *gradients], strict=True)))
+
+    for name, expected in results[1].items():
+        if expected is None:
+            assert results[0][name] is None, name
+            assert name.startswith(("prior", "encoder", "decoder")), name
+        else:
+            assert (results[0][name] - expected).abs().max() <= 1e-12 * max(1, expected.abs().max()), name
+
+
+@pytest.mark.usefixtures("same_noise")
+def test_filtering_one_step_is_the_step(family):
+    model, (observation, action, _) = random_model(family), sequences()
+    embedding, before = model.embed(observation), random_state(model)
+
+    filtered = model.filter(embedding[:, :1], action[:, :1], before)
+    step = model.step(before, embedding[:, 0], action[:, 0])
+
+    torch.testing.assert_close(Filtered(*(values[:, 0] for values in filtered)), step, rtol=0, atol=0)
+
+
+def test_a_step_more_than_was_prepared_is_one_sentence(family):
+    model, (observation, action, _) = random_model(family), sequences()
+    step, state = model.prepare_step(model.embed(observation), action), model.initial(BATCH)
+
+    for _ in range(TIME):
+        step(state)
+
+    with pytest.raises(ForbesError, match=f"TimeLoop: more than {TIME} steps"):
+        step(state)
 
 
 @pytest.mark.usefixtures("same_noise")
