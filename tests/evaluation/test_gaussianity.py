@@ -81,7 +81,7 @@ def test_evaluate_says_it_of_prior_and_posterior(kind, tmp_path, capsys):
     assert fit("--config", write_config(tmp_path, kind), "--trainer.max_epochs", 1, "--run_dir", run) == 0
     assert forbes("evaluate", run, "--episodes", 2) == 0
 
-    assert "its KL from the nearest Gaussian" in capsys.readouterr().out
+    assert "KL from the nearest Gaussian" in capsys.readouterr().out
     for which in ("prior", "posterior"):
         entry = read_record(str(run))[f"{which}_non_gaussianity[episodes=2]"]
         assert entry["mean"] == pytest.approx(0, abs=0.01)

@@ -123,7 +123,7 @@ def test_evaluate_says_it_of_a_known_process_and_of_nothing_else(tmp_path, capsy
     capsys.readouterr()
 
     assert forbes("evaluate", tmp_path / "hike", tmp_path / "blind", "--episodes", 2) == 0
-    assert "how unsure it is of a reward it has met" in " ".join(capsys.readouterr().out.split())
+    assert "variance of the reward it has just observed" in " ".join(capsys.readouterr().out.split())
     key = "reward_uncertainty[episodes=2]"
     record = read_record(str(tmp_path / "hike"))
     assert record[key]["mean"] > 0
