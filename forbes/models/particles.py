@@ -8,8 +8,8 @@ r"""Sequential Monte Carlo: a belief of K weighted particles of (h, s), and the 
     \log p(o_{1:T}) \ge E \sum_t \log \hat p_t
 
 The product of all :math:`\hat p_t` is an unbiased estimate of p(o_1:T), so the mean of its logarithm is a bound
-(FIVO, Maddison et al., 2017, arXiv 1705.09279). Where the effective sample size falls below K / 2, particles are drawn
-anew, h and s jointly; `torch.where` decides, so shapes never depend on values.
+(FIVO, Maddison et al., 2017, arXiv 1705.09279). Where the effective sample size falls below K / 2, particles are
+resampled, h and s jointly; `torch.where` decides, so shapes never depend on values.
 """
 
 import math
@@ -39,7 +39,7 @@ _SOFTNESS = 0.5
 
 @printed_by_shape
 class Particles(NamedTuple):
-    """The particles of one step, before they are drawn anew."""
+    """The particles of one step, before they are resampled."""
 
     hidden: Tensor
     """h_t, `(K, B, H)`."""
@@ -154,8 +154,8 @@ def _choose(hidden: Tensor, state: Tensor, index: Tensor) -> State:
 class ParticleModel(StateSpaceModel):
     """An RSSM whose belief is K weighted particles, trained by their bound (DVRL, Igl et al., 2018, arXiv 1806.02426).
 
-    With K = 1 it is the RSSM itself. DVRL draws particles anew at every step; here only those do whose effective sample
-    size is below K / 2, since each draw costs variance. The gradient leaves out the choice of ancestors, as there.
+    With K = 1 it is the RSSM itself. DVRL resamples at every step. Here only sequences whose effective sample size is below
+    K / 2 do, since resampling adds variance. As in DVRL, the gradient leaves out the choice of ancestors.
 
     Args:
         parts: see `StateSpaceModel`.

@@ -1,7 +1,7 @@
 r"""Networks for observations of at most one pixel: an embedding in place of a convolution, logits of places.
 
 A pixel (i, j) is told apart by its own vector, and by those of its row and its column, which it shares with its
-neighbours: what is learned of one pixel is half learned of those beside it.
+neighbours: what is learned of one pixel is half learned of those next to it.
 """
 
 import torch
