@@ -154,8 +154,8 @@ def _choose(hidden: Tensor, state: Tensor, index: Tensor) -> State:
 class ParticleModel(StateSpaceModel):
     """An RSSM whose belief is K weighted particles, trained by their bound (DVRL, Igl et al., 2018, arXiv 1806.02426).
 
-    With K = 1 it is the RSSM itself. DVRL resamples at every step. Here only sequences whose effective sample size is below
-    K / 2 do, since resampling adds variance. As in DVRL, the gradient leaves out the choice of ancestors.
+    With K = 1 it is the RSSM itself. DVRL resamples at every step. Here only sequences whose effective sample size is
+    below K / 2 are resampled, since that adds variance. As in DVRL, the gradient leaves out the choice of ancestors.
 
     Args:
         parts: see `StateSpaceModel`.
