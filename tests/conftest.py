@@ -1,14 +1,16 @@
 """What several tests need: one thread, and a few digits that nobody has to read from the disk."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from small_strokes import write_config, write_strokes
 
 from forbes.commands.cli import main
+from forbes.data.strokes.file import StrokeArrays
 from forbes.runs import configuration, modules
 from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
 
@@ -80,3 +82,25 @@ def in_tmp_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Work in an empty folder, so that runs/ is made there."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="session")
+def make_arrays() -> Callable[..., StrokeArrays]:
+    """Make `StrokeArrays` of digits, each a list of strokes, each a list of pixels."""
+
+    def make(*digits: list[list[tuple[int, int]]]) -> StrokeArrays:
+        strokes = [stroke for digit in digits for stroke in digit]
+        points = np.array([pixel for stroke in strokes for pixel in stroke], np.uint8)
+        pen_up = np.zeros(len(points), bool)
+        pen_up[np.cumsum([len(stroke) for stroke in strokes]) - 1] = True
+        offsets = np.cumsum([0, *(sum(map(len, digit)) for digit in digits)]).astype(np.int32)
+        return StrokeArrays(points, pen_up, offsets, np.arange(len(digits), dtype=np.uint8) % 10)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def mnist_digits() -> tuple[np.ndarray, np.ndarray]:
+    """The first ten MNIST test images, uint8 (10, 28, 28), and their labels, uint8 (10,)."""
+    with np.load(Path(__file__).parent / "data" / "mnist_test_0_to_9.npz") as file:
+        return file["images"], file["labels"]

@@ -56,10 +56,14 @@ def blocks():
     return found
 
 
+def commands_of(block):
+    """The commands of a block: a line each, or a file that is written from `<<'END'` to `END`."""
+    return re.findall(r"^.*<<'END'\n(?:.*\n)*?END$|^.+$", block.text, re.MULTILINE) if block.kind == "sh" else []
+
+
 def commands(*programs):
     """The commands of all recipes that call one of these programs."""
-    lines = [line for block in blocks() if block.kind == "sh" for line in block.text.splitlines()]
-    return [line for line in lines if line.split()[0] in programs]
+    return [line for block in blocks() for line in commands_of(block) if line.split()[0] in programs]
 
 
 def apply(edits, root):
@@ -92,7 +96,7 @@ def test_every_recipe_works_word_for_word(in_tmp_path):
     for block in blocks():
         if block.kind == "diff":
             apply(block.text, in_tmp_path)
-        for line in block.text.splitlines() if block.kind == "sh" else []:
+        for line in commands_of(block):
             if line.split()[0] not in PROGRAMS:
                 subprocess.run(["bash", "-c", line], check=True)
     Path("follow.py").write_text(FOLLOW)

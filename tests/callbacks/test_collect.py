@@ -222,7 +222,7 @@ def test_a_hanging_environment_ends_training_after_a_timeout(tmp_path, capsys):
     assert fit("--config", write_config(tmp_path), *hangs, "--run_dir", tmp_path / "run") == 2
 
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "it hangs, no answer to step within 1 s; so broke episode 0 3 times" in error
+    assert "it hangs, no answer to step within 1 s; episode 0 failed 3 times" in error
     for seconds in ("0", ".nan", ".inf"):
         assert fit("--config", write_config(tmp_path), "--data.source.timeout", seconds) == 2
         assert f"Experience: timeout is {float(seconds.strip('.'))}" in capsys.readouterr().err

@@ -30,7 +30,7 @@ def test_it_prints_the_coverage_and_draws_the_ranks(run, tmp_path, capsys):
     assert main(["calibrate", run, *numbers, "-o", str(tmp_path)]) == 0
 
     out = capsys.readouterr().out
-    assert "60 states drawn from the model, ranked among 19 of the belief" in out
+    assert "60 states sampled from the model" in out
     assert "within 90 %" in out
     assert "p, classifier" in out
     assert {path.name for path in tmp_path.iterdir()} == {"calibration.png", "calibration.pdf"}

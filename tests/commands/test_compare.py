@@ -277,7 +277,7 @@ def test_a_run_that_was_trained_otherwise_is_refused(configs, compared, capsys):
     assert main(["compare", *configs, "-o", str(compared), *MEASURES]) == 2
 
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "rssm-0: was trained with trainer.max_epochs = 1, expected 2. Give the configuration" in error
+    assert "rssm-0: was trained with trainer.max_epochs = 1, expected 2. Use its configuration" in error
 
 
 def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_path, capsys):

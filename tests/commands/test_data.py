@@ -76,8 +76,8 @@ def test_fetch_stores_where_forbes_data_points(make_arrays, tmp_path, monkeypatc
 def test_fetched_curves_are_stored_there_too(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FORBES_DATA", str(tmp_path / "store"))
     (tmp_path / "copy.json").write_text("[]")
-    for module in ("published", "commands"):
-        monkeypatch.setattr(f"forbes.data.{module}.CURVES_BLOB", git_blob_id(tmp_path / "copy.json"))
+    for module in ("data.download", "commands.data"):
+        monkeypatch.setattr(f"forbes.{module}.CURVES_BLOB", git_blob_id(tmp_path / "copy.json"))
 
     main(["fetch", "curves", "--from", str(tmp_path / "copy.json")])
 

@@ -39,7 +39,7 @@ def test_info_says_what_there_is_and_draws_it(pictures, tmp_path, capsys):
     output = capsys.readouterr().out
     for line in (
         r"task +Pictures",
-        r"episodes +4, of 4 ever stored; 0 terminated",
+        r"episodes +4 of 4 ever stored; 0 terminated",
         r"steps +16 agent steps, 16 env steps \(frames, with action repeat\)",
         r"return +4\.000 to 4\.000, mean 4\.000",
         r"reward per step +1\.000 to 1\.000, mean 1\.000",

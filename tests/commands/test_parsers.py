@@ -46,7 +46,7 @@ def test_the_help_of_an_option_states_its_default(action):
     ("option", "flag", "stated"),
     [
         ("action_repeat", "--action-repeat", "default: {suite} in DeepMind Control, {gymnasium} in Gymnasium"),
-        ("size", "--size", "default: {suite} of those that are drawn"),
+        ("size", "--size", "default: {suite} if they are rendered"),
         ("pixels", "--no-pixels", "default: images in DeepMind Control only"),
     ],
 )

@@ -186,7 +186,7 @@ def test_no_two_batches_share_their_noise(argument, batches, tiny_config, in_tmp
     [
         ("max_steps", "7", "is 7, expected -1. An agent trains in whole epochs, each with an episode of its own"),
         ("max_time", "00:01:00:00", "expected null. An agent trains in whole epochs"),
-        ("overfit_batches", "2", "is 2, expected 0. The episodes that an agent draws from grow in number"),
+        ("overfit_batches", "2", "is 2, expected 0. The replay of an agent grows during training"),
     ],
 )
 def test_an_agent_trains_in_whole_epochs(argument, value, sentence, in_tmp_path, capsys):

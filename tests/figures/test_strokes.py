@@ -193,7 +193,7 @@ def test_its_help_says_how_digits_are_chosen(capsys):
         main(["figures", "--help"])
     out = " ".join(capsys.readouterr().out.split())
     assert "forbes figures strokes --runs" in out
-    assert "No model has a say in the choice" in out
+    assert "The choice does not depend on any model" in out
 
 
 def test_a_panel_shows_each_frame_at_its_place_and_in_its_ink():

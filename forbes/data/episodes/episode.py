@@ -111,7 +111,8 @@ class EpisodeRecord(NamedTuple):
     @property
     def settings(self) -> dict[str, Any]:
         """Settings that all episodes of a store must have in common."""
-        settings = {"time_limit": TIME_LIMIT} | self.environment  # records of older versions have no time_limit
+        limit = self.environment.get("time_limit", TIME_LIMIT)  # records of older versions have none
+        settings = self.environment | {"time_limit": limit}
         return {name: value for name, value in settings.items() if name != "made_by"}
 
 

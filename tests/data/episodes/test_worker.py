@@ -68,7 +68,7 @@ def test_an_environment_that_breaks_each_time_is_named(trouble, tmp_path):
     timeout = 1.0 if trouble == "hangs" else 60.0
     with closing(EpisodeWorker(partial(Troubled, trouble, tmp_path / "ledger", times=9), timeout)) as player:
         player.begin(Said(0.5), number=4, seed=0)
-        with pytest.raises(ForbesError, match=f"{trouble}.* so broke episode 4 3 times, nothing of it is stored"):
+        with pytest.raises(ForbesError, match=f"{trouble}.* episode 4 failed 3 times and was not stored"):
             player.finish()
 
 
