@@ -7,6 +7,7 @@ from functools import partial
 
 import pytest
 import torch
+from batches import batch_of
 from lightning import LightningModule
 from small_agents import fit, write_config
 
@@ -56,8 +57,7 @@ def make_batch(seed):
     generator = torch.Generator().manual_seed(seed)
     observation = torch.randint(256, (BATCH, TIME, 3, 28, 28), dtype=torch.uint8, generator=generator)
     action, reward = torch.rand(BATCH, TIME, 2, generator=generator), torch.rand(BATCH, TIME, generator=generator)
-    mask = torch.ones(BATCH, TIME, dtype=torch.bool)
-    return SequenceBatch(observation, action, reward, mask, torch.zeros(BATCH, TIME, 0), ~mask)
+    return batch_of(observation, action, reward)
 
 
 def results(total_loss, agent, batch):

@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from batches import batch_of
 from torch import nn
 
 from forbes.beliefs import BeliefHead, FlowBelief, GaussianBelief
@@ -51,13 +52,10 @@ def make_model(belief=Certain, likelihood=None, actions=2, build=StateSpaceModel
 def make_batch(sequences=7, actions=2):
     generator = torch.Generator().manual_seed(1)
     length = torch.randint(1, STEPS + 1, (sequences, 1), generator=generator)
-    return SequenceBatch(
+    return batch_of(
         observation=torch.randint(0, 2, (sequences, STEPS, *SHAPE), generator=generator, dtype=torch.uint8),
         action=torch.randn(sequences, STEPS, actions, generator=generator, dtype=torch.float64),
-        reward=torch.zeros(sequences, STEPS),
         mask=torch.arange(STEPS) < length,
-        state=torch.zeros(sequences, STEPS, 0),
-        ended=torch.zeros(sequences, STEPS) > 0,
     )
 
 

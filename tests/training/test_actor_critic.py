@@ -5,10 +5,10 @@ from functools import partial
 
 import pytest
 import torch
+from batches import batch_of
 
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.control.actor_critic import sample_starts
-from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.models import MLPDecoder, MLPEncoder, State, VectorNormal
 from forbes.training import ImaginationActorCritic, WorldModel
@@ -48,8 +48,7 @@ def make_batch(batch=BATCH, time=TIME, seed=0):
     action[:, 0] = 0
     reward = -action[..., 0] * action[..., 0].roll(1, 1)
     reward[:, 0] = 0
-    mask = torch.ones(batch, time, dtype=torch.bool)
-    return SequenceBatch(action.clone(), action, reward, mask, torch.zeros(batch, time, 0), ~mask)
+    return batch_of(action.clone(), action, reward)
 
 
 def loss_of(module, batch):
@@ -271,8 +270,7 @@ def one_of_two(batch, time, seed):
     action[:, 0] = 0
     reward = 1 - 2 * (action * action.roll(1, 1)).sum(-1)
     reward[:, :2] = 0
-    mask = torch.ones(batch, time, dtype=torch.bool)
-    return SequenceBatch(action.clone(), action, reward, mask, torch.zeros(batch, time, 0), ~mask)
+    return batch_of(action.clone(), action, reward)
 
 
 def test_never_predicting_an_end_equals_having_no_prediction():

@@ -4,10 +4,10 @@ from functools import partial
 
 import pytest
 import torch
+from batches import batch_of
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from forbes.beliefs import FlowBelief, GaussianBelief
-from forbes.data import SequenceBatch
 from forbes.models import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder, Normal, VectorNormal
 from forbes.training import ImaginationActorCritic, PlanningAgent
 from forbes.training.acting import WorldModelAgent
@@ -66,8 +66,8 @@ def make_batch(kind):
     observation = torch.rand(BATCH, TIME, *shape, generator=generator)
     if len(shape) == 3:
         observation = (255 * observation).to(torch.uint8)
-    action, mask = torch.rand(BATCH, TIME, 2, generator=generator), torch.ones(BATCH, TIME, dtype=torch.bool)
-    return SequenceBatch(observation, action, action[..., 0], mask, torch.zeros(BATCH, TIME, 0), ~mask)
+    action = torch.rand(BATCH, TIME, 2, generator=generator)
+    return batch_of(observation, action, action[..., 0])
 
 
 @pytest.mark.parametrize("kind", AGENTS)

@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from batches import batch_of
 
 from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief, MixtureBelief
 from forbes.commands.cli import main
@@ -57,8 +58,7 @@ def make_batch():
     generator = torch.Generator().manual_seed(0)
     observation = torch.randint(2, (BATCH, TIME, *SHAPE), generator=generator, dtype=torch.uint8)
     action, reward = torch.rand(BATCH, TIME, 2, generator=generator), torch.rand(BATCH, TIME, generator=generator)
-    mask = torch.ones(BATCH, TIME, dtype=torch.bool)
-    return SequenceBatch(observation, action, reward, mask, torch.zeros(BATCH, TIME, 0), ~mask)
+    return batch_of(observation, action, reward)
 
 
 def in_both(function):

@@ -5,13 +5,13 @@ from functools import partial
 
 import pytest
 import torch
+from batches import batch_of
 from lightning import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
 from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief
 from forbes.commands.cli import main
-from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.models import (
     Bernoulli,
@@ -55,14 +55,8 @@ def make_batch(seed=0, batch=BATCH):
     generator = torch.Generator().manual_seed(seed)
     mask = torch.ones(batch, TIME, dtype=torch.bool)
     mask[0, 3:] = False
-    return SequenceBatch(
-        torch.randint(2, (batch, TIME, *SHAPE), generator=generator, dtype=torch.uint8),
-        torch.rand(batch, TIME, 1, generator=generator),
-        torch.zeros(batch, TIME),
-        mask,
-        torch.zeros(batch, TIME, 0),
-        torch.zeros_like(mask),
-    )
+    observation = torch.randint(2, (batch, TIME, *SHAPE), generator=generator, dtype=torch.uint8)
+    return batch_of(observation, torch.rand(batch, TIME, 1, generator=generator), mask=mask)
 
 
 class Batches(LightningDataModule):
