@@ -110,9 +110,8 @@ def complete(
         torch.Size([10, 8, 15, 1, 28, 28])
     """
     sequences = len(batch.observation)
-    start = model.sample_beliefs(
-        model.encode(batch.observation[:, :context], batch.action[:, :context]), samples
-    )  # (N B, ...)
+    encoded = model.encode(batch.observation[:, :context], batch.action[:, :context])
+    start = model.sample_beliefs(encoded, samples)  # (N B, ...)
     action = batch.action[:, context:].repeat(samples, 1, 1)  # (N B, T - context, A)
     output = model.decode(model.imagine(start, action).features)  # (N B, T - context, C, H, W)
     draw = source.increments and not mean

@@ -207,18 +207,17 @@ class StateSpaceModel(BeliefModel):
 
     def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
         """See `BeliefModel.sample_beliefs`: every sample has its own posterior trajectory, since h is random too."""
-        return self.filter(encoded.embedding.repeat(samples, 1, 1), encoded.action.repeat(samples, 1, 1)).at(
-            -1
-        )  # (N B, ...)
+        embedding = encoded.embedding.repeat(samples, 1, 1)  # (N B, T, E)
+        action = encoded.action.repeat(samples, 1, 1)  # (N B, T, A)
+        return self.filter(embedding, action).at(-1)  # (N B, ...)
 
     def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
         """See `BeliefModel.predictive_log_prob`: along one posterior trajectory."""
         filtered = self.filter(encoded.embedding, encoded.action)
 
         def score(features: Tensor) -> Tensor:
-            return log_likelihood(features.flatten(0, 1), encoded.target.flatten(0, 1)).view(
-                features.shape[:2]
-            )  # (B, T)
+            log_prob = log_likelihood(features.flatten(0, 1), encoded.target.flatten(0, 1))  # (B T,)
+            return log_prob.view(features.shape[:2])  # (B, T)
 
         return self.one_step_log_prob(filtered, score(filtered.features), score)
 
