@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from forbes.choices import PASSES, SUBSET, Split
-from forbes.commands.evaluate_agents import print_agents
 from forbes.commands.parsers.evaluate import parser
-from forbes.commands.tables import print_degradation, print_pairs, print_references, print_runs
+from forbes.commands.tables import print_agents, print_degradation, print_pairs, print_references, print_runs
 from forbes.data import Simulated
 from forbes.errors import ForbesError
 from forbes.evaluation.agents import evaluate_agents, is_agent
@@ -31,7 +30,7 @@ from forbes.evaluation.runs import (
     split_batches,
 )
 from forbes.evaluation.scoring import PartialScores, Scorer, exact_scorer, make_scorer, score_split, with_progress
-from forbes.runs.provenance import command_line, origin
+from forbes.runs.provenance import command_line, commit, origin
 
 __all__ = ["WantedMetrics", "evaluate", "main", "wanted_metrics"]
 
@@ -80,16 +79,19 @@ def evaluate(
     folders = folders or results_folders(paths)
     require_readable(folders.values())
     runs = load_runs(paths, find_device(args.device))
-    jobs = _jobs(args, runs)
+    jobs, code = _jobs(args, runs), commit()
     finished: list[PartialScores] = []
     measured = []
     for number, run in enumerate(runs):
         evaluated = EvaluatedRun(run, {}, {})
         for job in _of(run, jobs):
-            finished.append(_measure(evaluated, job, job.sha256[number], args, folders[run.path]))
+            parts = PartialScores(folders[run.path] / "evaluation-parts", code, *_key(run, job, number, args))
+            _measure(evaluated, job, job.sha256[number], args, parts)
+            finished.append(parts)
         _add_references(evaluated, jobs, args.split)
+        about = origin(command, args.seed) | {"parameters": run.parameters}
         for entry in evaluated.entries.values():
-            entry.update(origin(command, args.seed), parameters=run.parameters)
+            entry.update(about)
         measured.append(evaluated)
     for first, second, differences in compare_pairs(measured):
         record_differences(first, second, differences)
@@ -230,12 +232,14 @@ def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
     return f"{split}{part}/{metric}[{tag}]"
 
 
-def _measure(evaluated: EvaluatedRun, job: _Job, sha256: str, args: Any, folder: Path) -> PartialScores:
-    """Score a run and add the results to it. Return the saved partial scores, which are to be removed at the end."""
+def _key(run: TrainedRun, job: _Job, number: int, args: Any) -> tuple[object, ...]:
+    """Return what the scores of run `number` depend on, besides the code."""
+    return run.checkpoint, job.sha256[number], job.name, job.score.tag, job.score.batch_size, args.seed
+
+
+def _measure(evaluated: EvaluatedRun, job: _Job, sha256: str, args: Any, parts: PartialScores) -> None:
+    """Score a run and add the results to it; `parts` has what an interrupted evaluation has scored."""
     run, score = evaluated.run, job.score
-    parts = PartialScores(
-        folder / "evaluation-parts", run.checkpoint, sha256, job.name, score.tag, score.batch_size, args.seed
-    )
     began = time.monotonic()
     batches = split_batches(run.data, args.split, job.sequences, score.batch_size)
     batches = with_progress(batches, f"{run.path} {job.name}", job.sequences)
@@ -249,4 +253,3 @@ def _measure(evaluated: EvaluatedRun, job: _Job, sha256: str, args: Any, folder:
             "device": str(next(run.model.parameters()).device),
             "seconds": round(time.monotonic() - began, 1),
         }
-    return parts

@@ -41,10 +41,8 @@ _SOFTNESS = 0.5
 class Particles(NamedTuple):
     """The particles of one step, before they are resampled."""
 
-    hidden: Tensor
-    """h_t, `(K, B, H)`."""
-    state: Tensor
-    """s_t, `(K, B, D)`."""
+    filtered: Filtered
+    """(h_t, s_t) with context and density, `(K B, ...)`, particle-major."""
     log_before: Tensor
     """log W_{t-1} of those they come from, `(K, B)`; after soft resampling not normalised."""
     log_weight: Tensor
@@ -53,8 +51,6 @@ class Particles(NamedTuple):
     """log p(o_t | h_t, s_t) in nats, `(K, B)`."""
     increment: Tensor
     """What the step adds to the bound, log p̂_t in nats, `(B,)`."""
-    filtered: Filtered
-    """The same particles with context and density, `(K B, ...)`."""
 
 
 def effective_sample_size(log_weight: Tensor) -> Tensor:
@@ -136,19 +132,18 @@ def run_particles(
         joint = log_before + reconstruction - divergence
         increment = joint.logsumexp(0)  # (B,)
         log_weight = joint - increment
-        hidden, state = (values.view(*stay.shape, -1) for values in (moved.hidden, moved.state))  # (K, B, ...)
-        yield Particles(hidden, state, log_before, log_weight, reconstruction, increment, moved)
+        yield Particles(moved, log_before, log_weight, reconstruction, increment)
         again = effective_sample_size(log_weight) < number / 2  # (B,)
         ancestor, log_child = resampling(log_weight)
-        carried = _choose(hidden, state, torch.where(again, ancestor, stay))
+        carried = _choose(moved, torch.where(again, ancestor, stay))
         log_before = torch.where(again, log_child, log_weight)
 
 
-def _choose(hidden: Tensor, state: Tensor, index: Tensor) -> State:
-    """Take particles `(K, B, ...)` by their index within each sequence, `(N, B)`: `(N B, ...)`; h and s go together."""
+def _choose(filtered: Filtered, index: Tensor) -> State:
+    """Take particles `(K B, ...)` by their index within each sequence, `(N, B)`: `(N B, ...)`; h and s go together."""
     sequences = index.shape[1]
     row = (index * sequences + torch.arange(sequences, device=index.device)).flatten()  # (N B,)
-    return State(hidden.flatten(0, 1)[row], state.flatten(0, 1)[row])  # (N B, ...)
+    return State(filtered.hidden[row], filtered.state[row])  # (N B, ...)
 
 
 class ParticleModel(StateSpaceModel):
@@ -201,7 +196,7 @@ class ParticleModel(StateSpaceModel):
         """See `BeliefModel.sample_beliefs`: a systematic sample of one weighted set, with repetitions."""
         last = deque(self._run(encoded), maxlen=1)[0]
         uniform = torch.rand_like(last.log_weight[0])  # (B,)
-        return _choose(last.hidden, last.state, systematic_resampling(last.log_weight, uniform, samples))
+        return _choose(last.filtered, systematic_resampling(last.log_weight, uniform, samples))
 
     def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
         """See `BeliefModel.predictive_log_prob`: the weighted mean over one set of particles."""

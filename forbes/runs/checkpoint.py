@@ -250,7 +250,7 @@ def _is_intact(path: Path) -> bool:
 
 
 def _name_too(path: Path, name: str) -> None:
-    """Give a file a second name in its folder, replacing the file of that name: a hard link, or a copy."""
+    """Link a file to a second name in its folder, replacing the file there; copy it where links are not possible."""
     temporary = path.with_name(f".{name}.part")
     temporary.unlink(missing_ok=True)
     try:

@@ -18,6 +18,7 @@ from forbes.models.likelihoods import Likelihood, Normal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
 from forbes.models.state_space import StateSpaceModel
 from forbes.runs.hyperparameters import plain_arguments
+from forbes.runs.modules import load_module
 from forbes.signatures import full_signature
 from forbes.training.defaults import defaults_for
 from forbes.training.requirements import require_mean, require_path, require_rank
@@ -176,8 +177,6 @@ class WorldModel(SeededModule):
         Raises:
             ForbesError: where the checkpoint is damaged, of another class, or does not fit the arguments.
         """
-        from forbes.runs.modules import load_module  # it imports the models
-
         return load_module(Path(checkpoint_path), cls, arguments).train().to(map_location)
 
     @property

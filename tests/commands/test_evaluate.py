@@ -285,7 +285,10 @@ def test_too_many_particles_for_memory_are_named_after_a_retry(runs, capsys):
     assert record_is_missing(runs[0])
 
 
-def test_an_interrupted_evaluation_goes_on_where_it_stopped(runs, monkeypatch):
+@pytest.mark.parametrize(("code", "left"), [("same", 1), ("another", 3)])
+def test_an_interrupted_evaluation_goes_on_where_it_stopped(runs, monkeypatch, code, left):
+    """By another commit it starts again: a score must be of the code that its record names."""
+    monkeypatch.setattr("forbes.commands.evaluate.commit", lambda: "same")
     evaluate(runs[0], "--batch-size", "5")
     whole, calls = record(runs[0])[NAME], []
 
@@ -299,11 +302,12 @@ def test_an_interrupted_evaluation_goes_on_where_it_stopped(runs, monkeypatch):
     monkeypatch.setattr(scoring, "_score", partial(counted, stop_at=3))
     assert evaluate(runs[0], "--batch-size", "5") == 130
     monkeypatch.setattr(scoring, "_score", counted)
+    monkeypatch.setattr("forbes.commands.evaluate.commit", lambda: code)
     assert evaluate(runs[0], "--batch-size", "5") == 0
 
-    assert len(calls) == 3 + 1  # two batches and the stop, then the third batch
+    assert len(calls) == 3 + left  # two batches and the stop, then what is left of three batches
     assert record(runs[0])[NAME]["curve"] == whole["curve"]
-    assert not (RunFolder(runs[0]).path / "evaluation-parts").exists()
+    assert (RunFolder(runs[0]).path / "evaluation-parts").exists() == (code == "another")
 
 
 def test_partial_scores_serve_only_their_seed_and_checkpoint(runs, monkeypatch):

@@ -71,7 +71,7 @@ def elbo(model, batches, samples, **options):
 
 
 def plain_elbo(model, observation, action, steps):
-    """J of one sequence, a step at a time: filter, decode, compare (DESIGN §5)."""
+    """J of one sequence, a step at a time: filter, decode, compare."""
     hidden, state = model.initial(1)
     total = 0.0
     for t in range(steps):

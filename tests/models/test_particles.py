@@ -160,11 +160,11 @@ def test_a_belief_is_drawn_as_often_as_its_weights_say(monkeypatch):
     model, _ = particle_model(8)
     with torch.no_grad():
         *_, last = model._run(seen_by(model, drawn(1, seed=1), 1))
-    particles = last._replace(
-        hidden=last.hidden.expand(8, 1000, -1),
-        state=torch.arange(8.0)[:, None, None].expand(8, 1000, 1),
-        log_weight=log_weights().expand(8, 1000),
+    filtered = last.filtered._replace(
+        hidden=last.filtered.hidden.repeat_interleave(1000, 0),
+        state=torch.arange(8.0).repeat_interleave(1000)[:, None],  # each particle has its number
     )
+    particles = last._replace(filtered=filtered, log_weight=log_weights().expand(8, 1000))
     grid_of_u(monkeypatch, 1000)
     monkeypatch.setattr(model, "_run", lambda encoded: iter([particles]))
 
@@ -232,10 +232,11 @@ def test_hidden_and_stochastic_states_are_redrawn_together():
         model, encoded, 3, systematic, lambda features, target: next(given), dtype=torch.float64
     )
 
-    parents = torch.cat((before.state, action[:, 2].expand(3, -1, -1)), -1)  # (3, B, D + A)
-    moved = model.gru(model.transition(parents).flatten(0, 1), before.hidden.flatten(0, 1)).view_as(before.hidden)
-    same = (after.hidden[:, None] - moved[None]).abs().amax(-1) < 1e-9  # (child, parent, B)
-    assert (before.hidden.diff(dim=0).abs().amax(-1) > 1e-6).any()  # h tells particles apart
+    parents = torch.cat((before.filtered.state, action[:, 2].repeat(3, 1)), -1)  # (3 B, D + A)
+    moved = model.gru(model.transition(parents), before.filtered.hidden)
+    was, parent, child = (h.unflatten(0, (3, -1)) for h in (before.filtered.hidden, moved, after.filtered.hidden))
+    same = (child[:, None] - parent[None]).abs().amax(-1) < 1e-9  # (child, parent, B)
+    assert (was.diff(dim=0).abs().amax(-1) > 1e-6).any()  # h tells particles apart
     assert same.any(1).all()
     assert (effective_sample_size(before.log_weight) < 1.5).all()
     assert not same.diagonal(dim1=0, dim2=1).all()
