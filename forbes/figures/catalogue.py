@@ -32,8 +32,20 @@ class CatalogueEntry(NamedTuple):
 _Entry = CatalogueEntry
 _CHOSEN = ("index", "samples", "mean", "context")
 FIGURES = (
+    _Entry(
+        "beliefs", "1", "beliefs over time next to the exact one", "a known process", "beliefs:draw_beliefs", ("index",)
+    ),
     _Entry("predictions", "4", "completions next to the truth", "images", "predictions:draw_predictions", _CHOSEN),
     _Entry("elbo", "5", "validation ELBO against updates", "any world model", "elbo:draw_elbo"),
+    _Entry(
+        "per-step",
+        "ours",
+        "ELBO, log-likelihood and KL at each step",
+        "evaluated world models",
+        "scores:draw_per_step_elbo",
+    ),
+    _Entry("prequential", "ours", "prequential log-likelihood", "evaluated world models", "scores:draw_prequential"),
+    _Entry("calibration", "ours", "calibration of the filter", "models with a state", "calibration:draw_calibration"),
     _Entry("returns", "6", "returns against env steps", "agents", "returns:draw_returns"),
 )
 """The figures, in the order of the paper."""

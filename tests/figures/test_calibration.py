@@ -5,7 +5,7 @@ import torch
 
 from forbes.errors import ForbesError
 from forbes.figures.calibration import RankedBelief, calibration
-from forbes.figures.style import BLUE, ORANGE, save_figure
+from forbes.figures.style import BLUE, ORANGE, Method, save_figure
 
 SAMPLES, COUNT = 39, 500
 
