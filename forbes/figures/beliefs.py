@@ -28,9 +28,9 @@ __all__ = ["DrawnBelief", "beliefs_over_time", "draw_beliefs", "least_gaussian"]
 
 _CANDIDATES, _ROWS, _POINTS = 200, 20, 200
 """Number of test sequences to choose from, sequences filtered at a time, and samples of their beliefs."""
-_SAMPLES = 4000
+_SAMPLES = 8000
 """Number of samples of each belief drawn."""
-_LINE_BINS, _PLANE_BINS = 100, 40
+_LINE_BINS, _PLANE_BINS = 100, 32
 _EXACT = "exact belief"
 
 

@@ -115,7 +115,7 @@ def _draw_steps(axes: Axes, curves: dict[str, list[float]], metric: str, styles:
         axes.plot(steps[shown], np.asarray(curve)[shown], color=style.colour, ls=style.line, label=method_title(name))
     axes.set_title(_in_lines(metric))
     axes.set_xlabel("step")
-    axes.set_ylabel("fraction of K" if score_of(metric) == "ess" else "nats")
+    axes.set_ylabel("fraction of K" if score_of(metric) == "ess" else "nats per step")
 
 
 def draw_differences(comparison: Comparison, first: str) -> Figure:

@@ -66,10 +66,11 @@ def draw_prequential(runs: Sequence[str]) -> dict[str, Figure]:
         _draw_steps(steps, families, name, baseline)
         if exact:
             steps.plot(baseline.index, exact["curve"] - baseline, color=BLACK, lw=0.8, label="exact log p")
-        steps.set(title=f"minus {families[0].name}, at each step", xlabel="step t", ylabel="nats per step")
+        title = rf"$\log p(o_t | o_{{1:t-1}})$ minus {families[0].name}'s"
+        steps.set(title=title, xlabel="step t", ylabel="nats per step")
         _draw_totals(totals, families, name, exact)
         draw_references(totals, {name: each["mean"] for name, each in first[name].get("references", {}).items()}, "x")
-        totals.set(title="of the sequence", xlabel="nats per sequence, higher is better")
+        totals.set(title=r"$\log p(o_{1:T})$, its sum", xlabel="nats per sequence, higher is better")
         totals.locator_params("x", nbins=5)
         _draw_legend(figure, steps)
         figure.supxlabel(name, fontsize=7)
