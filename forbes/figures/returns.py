@@ -2,19 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from forbes.data.download import curves_path
 from forbes.errors import ForbesError
 from forbes.figures.style import COLUMN, GREY, ORANGE, PALETTE, draw_range, paper_style
-from forbes.reading import read_json, readable
 
-__all__ = ["published_curves", "return_curve", "returns_against_env_steps"]
+__all__ = ["return_curve", "returns_against_env_steps"]
 
 
 def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Sequence[pd.Series]]) -> Figure:
@@ -72,36 +69,3 @@ def _label(axes: Axes, task: str, end: float) -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
     axes.locator_params("x", nbins=6)
     axes.legend(loc="best")
-
-
-def published_curves(path: str | None, task: str) -> dict[str, list[pd.Series]]:
-    """Read the published curves of a task: returns against env steps by method, one per seed.
-
-    Args:
-        path: file with a JSON list of `{"task": …, "method": …, "seed": …, "xs": [env steps], "ys": [returns]}`, as
-            published by the authors of Dreamer; their task names may begin with `dmc_`. None for the file of
-            `forbes data fetch curves`, which gives no curves if it is missing or lacks the task.
-        task: name of the task, e.g. `cartpole_swingup`.
-
-    Raises:
-        ForbesError: if the file is invalid, or a file given by `path` lacks the task.
-    """
-    if path is None and not curves_path().is_file():
-        return {}
-    names = {task, f"dmc_{task}", f"dmc_{task.removeprefix('ball_in_')}"}  # Dreamer calls ball_in_cup_catch cup_catch
-    curves: dict[str, list[pd.Series]] = {}
-    known = set()
-    file, remedy = Path(path or curves_path()), "Name another, or none"
-    if not file.is_file():
-        raise ForbesError(f"{file}: no such file. {remedy}")
-    found = read_json(file, remedy)
-    with readable(file, "a file of curves, expected a JSON list of task, method, seed, xs and ys", remedy):
-        for one in found:
-            known.add(one["task"])
-            if one["task"] in names:
-                curve = pd.Series(one["ys"], index=one["xs"], dtype=float)
-                curves.setdefault(one["method"], []).append(curve)
-    if path and not curves:
-        listed = ", ".join(sorted(known)) or "nothing"
-        raise ForbesError(f"{path}: has no curve for {task}, only for {listed}. Name another file, or none")
-    return curves

@@ -8,7 +8,6 @@ from torch.distributions import Normal
 
 from forbes.evaluation.returns import aggregate, interquartile_mean, probability_of_improvement, stratified_interval
 
-
 TRIALS = 200
 
 
