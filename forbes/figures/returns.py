@@ -1,7 +1,8 @@
 """Plot the returns of agents against env steps, with published curves for comparison."""
 
+import re
 from collections.abc import Mapping, Sequence
-from itertools import cycle
+from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
@@ -9,9 +10,48 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from forbes.errors import ForbesError
-from forbes.figures.style import COLUMN, GREY, ORANGE, PALETTE, draw_range, paper_style
+from forbes.figures.style import BLACK, COLUMN, GREY, draw_range, method_styles, method_title, paper_style
+from forbes.runs.folder import RunFolder, read_config, read_metrics
 
-__all__ = ["return_curve", "returns_against_env_steps"]
+__all__ = ["draw_returns", "return_curve", "returns_against_env_steps"]
+
+
+def draw_returns(runs: Sequence[str]) -> dict[str, Figure]:
+    """Draw the returns of agents on one task without exploration against env steps.
+
+    Runs whose folder names differ only in the number at the end form one curve, named after the folders.
+
+    Raises:
+        ForbesError: if a run has no measured returns, or the runs are of several tasks.
+    """
+    return {"returns": returns_against_env_steps(*_agents(runs))}
+
+
+def _agents(runs: Sequence[str]) -> tuple[str, dict[str, list[pd.Series]]]:
+    """Return the task of the agents, and the curves of their returns, one per seed, by name."""
+    curves: dict[str, list[pd.Series]] = {}
+    tasks = set()
+    for run in runs:
+        metrics = read_metrics(run)
+        if not {"env_steps", "return/acting"} <= {*metrics}:
+            raise ForbesError(f"{run}: metrics.jsonl has no return/acting. Name runs of agents with measured returns")
+        tasks.add(_task(RunFolder(run).config))
+        name = re.sub(r"-\d+$", "", Path(run).absolute().name)
+        measured = metrics[["env_steps", "return/acting"]].dropna()
+        curves.setdefault(name, []).append(measured.set_index("env_steps")["return/acting"])
+    if len(tasks) > 1:
+        raise ForbesError(
+            f"--runs: the tasks are {' and '.join(sorted(tasks))}, expected one task. Draw each task separately"
+        )
+    return tasks.pop(), curves
+
+
+def _task(path: Path) -> str:
+    """Return the task in an agent's configuration."""
+    try:
+        return str(read_config(path)["data"]["init_args"]["source"]["init_args"]["task"])
+    except (KeyError, TypeError) as error:
+        raise ForbesError(f"{path}: its data have no task, expected Experience. Name runs of agents") from error
 
 
 def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Sequence[pd.Series]]) -> Figure:
@@ -27,11 +67,13 @@ def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Seque
     with paper_style():
         figure = Figure((COLUMN, 2.3), layout="constrained")
         axes = figure.subplots()
-        for (method, curves), colour in zip(published.items(), cycle((ORANGE, *PALETTE[2:])), strict=False):
-            draw_range(axes, _joined(curves), colour, f"{method}, published, {len(curves)} seeds")
+        for method, style in method_styles([*published]).items():
+            curves = published[method]
+            label = f"{method_title(method)}, published, {len(curves)} seeds"
+            draw_range(axes, _joined(curves), style, label)
         marker = "." if len(exploring) == 1 else ""
         axes.plot(exploring.index, exploring, color=GREY, lw=0.6, label="exploring", marker=marker)
-        axes.plot(acting.index, acting, ".-", color=PALETTE[0], markersize=3, label="acting, without exploration")
+        axes.plot(acting.index, acting, ".-", color=BLACK, markersize=3, label="acting, without exploration")
         _label(axes, task, table.index.max())
     return figure
 
@@ -49,11 +91,12 @@ def returns_against_env_steps(task: str, agents: Mapping[str, Sequence[pd.Series
     with paper_style():
         figure = Figure((COLUMN, 2.6), layout="constrained")
         axes = figure.subplots()
-        for (name, curves), colour in zip(agents.items(), cycle(PALETTE), strict=False):
-            label = name if len(curves) == 1 else f"{name}, {len(curves)} seeds"
+        styles = method_styles([*agents])
+        for name, curves in agents.items():
+            label = method_title(name) + (f", {len(curves)} seeds" if len(curves) > 1 else "")
             if (joined := _joined(curves)).empty:
                 raise ForbesError(f"{name}: no step was reached by all its {len(curves)} seeds. Train them further")
-            draw_range(axes, joined, colour, label)
+            draw_range(axes, joined, styles[name], label)
         _label(axes, task, max(curve.index.max() for curves in agents.values() for curve in curves))
     return figure
 

@@ -1,4 +1,4 @@
-"""`forbes figures agents`: learning curves from run folders, seeds joined."""
+"""`forbes figures returns`: learning curves from run folders, seeds joined."""
 
 import json
 
@@ -41,7 +41,7 @@ def test_seeds_meet_at_all_steps_that_all_have_reached():
     np.testing.assert_allclose(forbes.get_ydata(), [1, 5, 4])  # (0, 2), (2, 8), (4, 4)
     np.testing.assert_allclose(dreamer.get_ydata(), [0, 4])
     assert [to_hex(line.get_color()) for line in (forbes, dreamer)] == [BLUE, ORANGE]
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["forbes, 2 seeds", "dreamer"]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["FORBES, 2 seeds", "Dreamer"]
     assert axes.get_title() == "hike"
 
 
@@ -50,7 +50,7 @@ def test_an_agent_that_was_measured_once_is_a_dot():
 
     axes = returns_against_env_steps("hike", {"forbes": [one], "dreamer": [one, one + 1]}).axes[0]
 
-    assert [line.get_marker() for line in axes.lines] == ["o", "o"]
+    assert [line.get_marker() for line in axes.lines] == ["o", "s"]
     np.testing.assert_allclose([line.get_ydata() for line in axes.lines], [[3.0], [3.5]])
 
 
@@ -62,7 +62,7 @@ def test_curves_without_a_common_step_are_one_sentence():
 def test_folders_that_differ_in_the_number_are_seeds(runs, tmp_path, capsys):
     folders = [runs("forbes-0"), runs("forbes-1", returns=((10, 5.0), (20, 7.0))), runs("dreamer_n4-0")]
 
-    assert main(["figures", "agents", "--runs", *folders, "-o", str(tmp_path / "figures")]) == 0
+    assert main(["figures", "returns", "--runs", *folders, "-o", str(tmp_path / "figures")]) == 0
 
     assert capsys.readouterr().out.split() == [str(tmp_path / f"figures/returns.{kind}") for kind in ("png", "pdf")]
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"returns.png", "returns.pdf"}
@@ -72,7 +72,7 @@ def test_a_run_that_was_trained_is_drawn(tmp_path):
     run = tmp_path / "forbes-0"
     assert fit("--config", write_config(tmp_path), "--run_dir", run) == 0
 
-    assert main(["figures", "agents", "--runs", str(run), "-o", str(tmp_path / "figures")]) == 0
+    assert main(["figures", "returns", "--runs", str(run), "-o", str(tmp_path / "figures")]) == 0
 
 
 def test_what_cannot_be_drawn_is_one_sentence(runs, tmp_path, capsys):
@@ -81,7 +81,7 @@ def test_what_cannot_be_drawn_is_one_sentence(runs, tmp_path, capsys):
         ([str(tmp_path / "absent")], "absent/metrics.jsonl: no such file"),
         ([runs("c-0", returns=())], "metrics.jsonl has no return/acting"),
     ]:
-        assert main(["figures", "agents", "--runs", *arguments, "-o", str(tmp_path / "figures")]) == 2
+        assert main(["figures", "returns", "--runs", *arguments, "-o", str(tmp_path / "figures")]) == 2
         error = capsys.readouterr().err
         assert sentence in error
         assert error.count("\n") == 1
