@@ -8,15 +8,25 @@ ruled by its outliers and says nothing of its own error. So there are three numb
 - the probability that one method improves on another, on a task chosen at random.
 """
 
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
 from forbes.seeding import generator
 
-__all__ = ["Scores", "aggregate", "interquartile_mean", "probability_of_improvement", "stratified_interval"]
+__all__ = [
+    "Interval",
+    "Scores",
+    "Summary",
+    "aggregate",
+    "interquartile_mean",
+    "probability_of_improvement",
+    "stratified_interval",
+    "summarise",
+]
 
 Scores: TypeAlias = Sequence[Tensor]
 """Scores of a method, one tensor `(..., N_k)` per task, for its N_k seeds. Leading dimensions are resamples."""
@@ -79,3 +89,61 @@ def stratified_interval(
 def _resample(scores: Tensor, draw: torch.Generator) -> Tensor:
     """Sample as many scores as there are, with replacement, R times: `(N,)` to `(R, N)`."""
     return scores[torch.randint(len(scores), (_RESAMPLES, len(scores)), generator=draw)]
+
+
+class Interval(NamedTuple):
+    """A statistic with its bootstrap interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
+
+class Summary(NamedTuple):
+    """Several methods on the tasks that all of them have."""
+
+    tasks: list[str]
+    iqm: dict[str, Interval]
+    """Interquartile mean by method."""
+    seeds: dict[str, int]
+    """Number of scores by method, over all tasks."""
+    improvement: dict[tuple[str, str], Interval]
+    """Probability that the first method of each pair improves on the second."""
+
+    def lines(self) -> list[str]:
+        """Return a line for each method, and for each pair of methods."""
+        wide = max(map(len, self.iqm))
+        means = [f"{name:<{wide}}  {found}, {self.seeds[name]} runs" for name, found in self.iqm.items()]
+        pairs = [f"P({one} > {other}) = {found}" for (one, other), found in self.improvement.items()]
+        return means + pairs
+
+
+def summarise(methods: Mapping[str, Mapping[str, Sequence[float]]]) -> Summary | None:
+    """Summarise the scores of each method, one per seed, by task; None unless two methods have a task in common.
+
+    Without a second seed on any task an interval has no width.
+    """
+    first, *others = methods.values() if methods else [{}]
+    tasks = [task for task in first if all(task in other for other in others)]
+    if not others or not tasks:
+        return None
+    scores = {
+        name: [torch.tensor(of_method[task], dtype=torch.float64) for task in tasks]
+        for name, of_method in methods.items()
+    }
+    return Summary(
+        tasks,
+        {name: _interval(aggregate, each) for name, each in scores.items()},
+        {name: sum(map(len, each)) for name, each in scores.items()},
+        {
+            (one, other): _interval(probability_of_improvement, scores[one], scores[other])
+            for one, other in itertools.combinations(scores, 2)
+        },
+    )
+
+
+def _interval(statistic: Callable[..., Tensor], *methods: Scores) -> Interval:
+    return Interval(statistic(*methods).item(), *stratified_interval(statistic, *methods))

@@ -34,7 +34,11 @@ _CHOSEN = ("index", "samples", "mean", "context")
 FIGURES = (
     _Entry("predictions", "4", "completions next to the truth", "images", "predictions:draw_predictions", _CHOSEN),
     _Entry("elbo", "5", "validation ELBO against updates", "any world model", "elbo:draw_elbo"),
-    _Entry("returns", "6", "returns against env steps", "agents", "returns:draw_returns"),
+    _Entry("returns", "6", "returns against env steps", "agents", "agents:draw_returns"),
+    _Entry("returns-1m", "appendix", "the same up to 1M env steps", "agents", "agents:draw_returns_1m"),
+    _Entry("trajectories", "7", "Dreamer, N = 1 and 4, and FORBES", "agents", "agents:draw_trajectories"),
+    _Entry("trajectories-n", "appendix", "FORBES with N = 1, 2 and 4", "agents", "agents:draw_trajectories_n"),
+    _Entry("layers", "appendix", "Dreamer with more layers", "agents", "agents:draw_layers"),
 )
 """The figures, in the order of the paper."""
 
