@@ -33,20 +33,18 @@ _Entry = CatalogueEntry
 _CHOSEN = ("index", "samples", "mean", "context")
 FIGURES = (
     _Entry(
-        "beliefs", "1", "beliefs over time next to the exact one", "a known process", "beliefs:draw_beliefs", ("index",)
+        "beliefs", "1", "beliefs over time, next to the exact", "known processes", "beliefs:draw_beliefs", ("index",)
     ),
     _Entry("predictions", "4", "completions next to the truth", "images", "predictions:draw_predictions", _CHOSEN),
-    _Entry("elbo", "5", "validation ELBO against updates", "any world model", "elbo:draw_elbo"),
-    _Entry(
-        "per-step",
-        "ours",
-        "ELBO, log-likelihood and KL at each step",
-        "evaluated world models",
-        "scores:draw_per_step_elbo",
-    ),
-    _Entry("prequential", "ours", "prequential log-likelihood", "evaluated world models", "scores:draw_prequential"),
-    _Entry("calibration", "ours", "calibration of the filter", "models with a state", "calibration:draw_calibration"),
-    _Entry("returns", "6", "returns against env steps", "agents", "returns:draw_returns"),
+    _Entry("elbo", "5", "validation ELBO against updates", "world models", "elbo:draw_elbo"),
+    _Entry("per-step", "ours", "ELBO and its parts at each step", "world models, evaluated", "scores:draw_per_step"),
+    _Entry("prequential", "ours", "log p(o_t | past)", "world models, evaluated", "scores:draw_prequential"),
+    _Entry("calibration", "ours", "ranks of states, coverage", "world models", "calibration:draw_calibration"),
+    _Entry("returns", "6", "returns against env steps", "agents", "agents:draw_returns"),
+    _Entry("returns-1m", "appendix", "the same up to 1M env steps", "agents", "agents:draw_returns_1m"),
+    _Entry("trajectories", "7", "Dreamer, N = 1 and 4, and FORBES", "agents", "agents:draw_trajectories"),
+    _Entry("trajectories-n", "appendix", "FORBES with N = 1, 2 and 4", "agents", "agents:draw_trajectories_n"),
+    _Entry("layers", "appendix", "Dreamer with more layers", "agents", "agents:draw_layers"),
 )
 """The figures, in the order of the paper."""
 

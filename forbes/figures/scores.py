@@ -15,7 +15,7 @@ from forbes.evaluation.runs import TrainedRun, load_runs
 from forbes.figures.families import RunFamily, group, require_same_data
 from forbes.figures.style import BLACK, PAGE, draw_range, draw_references, paper_style
 
-__all__ = ["draw_per_step_elbo", "draw_prequential"]
+__all__ = ["draw_per_step", "draw_prequential"]
 
 _PARTS = {
     "elbo": "ELBO",
@@ -24,7 +24,7 @@ _PARTS = {
 }
 
 
-def draw_per_step_elbo(runs: Sequence[str]) -> dict[str, Figure]:
+def draw_per_step(runs: Sequence[str]) -> dict[str, Figure]:
     """Draw the recorded ELBO and its parts at each step, mean and range over the runs of each family.
 
     Each step's value is the mean over the sequences that have it.

@@ -15,8 +15,9 @@ from small_agents import fit, write_image_config
 from forbes.callbacks import EpisodeVideo, ImaginedFutures, OpenLoopPanel, ReturnCurve
 from forbes.callbacks.picture import shown_sequences
 from forbes.evaluation.predictions import open_loop_frames
+from forbes.evaluation.published import published_curves
 from forbes.figures.imagination import draw_futures
-from forbes.figures.returns import published_curves, return_curve
+from forbes.figures.returns import return_curve
 from forbes.figures.style import BLUE
 from forbes.figures.video import gif
 from forbes.runs.checkpoint import read_checkpoint

@@ -9,7 +9,7 @@ from command_line import error_of
 
 from forbes.commands.cli import main
 from forbes.evaluation.runs import load_runs
-from forbes.figures.scores import draw_per_step_elbo, draw_prequential
+from forbes.figures.scores import draw_per_step, draw_prequential
 from forbes.figures.style import METHODS
 
 
@@ -50,7 +50,7 @@ def test_the_elbo_of_each_step_is_the_mean_over_the_runs_of_a_family(record):
     first = record(0, "forbes-0", elbo=[-3.0, -1.0], reconstruction=[-1.0, 0.0], kl=[2.0, 1.0])
     second = record(0, "forbes-1", elbo=[-5.0, -2.0], reconstruction=[-1.0, 0.0], kl=[4.0, 2.0])
 
-    bound, reconstruction, kl = draw_per_step_elbo([first, second])["per-step"].axes
+    bound, reconstruction, kl = draw_per_step([first, second])["per-step"].axes
 
     np.testing.assert_allclose(bound.lines[0].get_xdata(), [1, 2])
     np.testing.assert_allclose(bound.lines[0].get_ydata(), [-4.0, -1.5])
