@@ -39,6 +39,15 @@ FIGURES = (
     _Entry("trajectories", "7", "Dreamer, N = 1 and 4, and FORBES", "agents", "agents:draw_trajectories"),
     _Entry("trajectories-n", "appendix", "FORBES with N = 1, 2 and 4", "agents", "agents:draw_trajectories_n"),
     _Entry("layers", "appendix", "Dreamer with more layers", "agents", "agents:draw_layers"),
+    _Entry("dmc-elbo", "appendix", "ELBO of stored episodes", "episodes, or agents", "dmc_elbo:draw_dmc_elbo"),
+    _Entry(
+        *("reconstructions", "appendix", "ten frames, truth and models", "images"),
+        *("reconstructions:draw_reconstructions", ("index", "context")),
+    ),
+    _Entry(
+        *("simcore", "appendix", "roll-outs that keep their digit, or do not", "strokes"),
+        *("simcore:draw_simcore", ("samples", "context")),
+    ),
 )
 """The figures, in the order of the paper."""
 
