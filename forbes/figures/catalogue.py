@@ -32,8 +32,14 @@ class CatalogueEntry(NamedTuple):
 _Entry = CatalogueEntry
 _CHOSEN = ("index", "samples", "mean", "context")
 FIGURES = (
+    _Entry(
+        "beliefs", "1", "beliefs over time, next to the exact", "known processes", "beliefs:draw_beliefs", ("index",)
+    ),
     _Entry("predictions", "4", "completions next to the truth", "images", "predictions:draw_predictions", _CHOSEN),
-    _Entry("elbo", "5", "validation ELBO against updates", "any world model", "elbo:draw_elbo"),
+    _Entry("elbo", "5", "validation ELBO against updates", "world models", "elbo:draw_elbo"),
+    _Entry("per-step", "ours", "ELBO and its parts at each step", "world models, evaluated", "scores:draw_per_step"),
+    _Entry("prequential", "ours", "log p(o_t | past)", "world models, evaluated", "scores:draw_prequential"),
+    _Entry("calibration", "ours", "ranks of states, coverage", "world models", "calibration:draw_calibration"),
     _Entry("returns", "6", "returns against env steps", "agents", "agents:draw_returns"),
     _Entry("returns-1m", "appendix", "the same up to 1M env steps", "agents", "agents:draw_returns_1m"),
     _Entry("trajectories", "7", "Dreamer, N = 1 and 4, and FORBES", "agents", "agents:draw_trajectories"),

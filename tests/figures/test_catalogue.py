@@ -56,7 +56,7 @@ def test_names_and_numbers_are_found_once():
         (["predictons", "--runs", "a"], "predictons: no such figure. Did you mean predictions?"),
         (["9", "--runs", "a"], "9: no such figure. There are "),
         (["elbo"], "forbes figures elbo: no runs to draw. Name some: --runs RUN"),
-        (["elbo", "--runs", "a", "--index", "3"], "--index: is an option of predictions, not of elbo. Leave it out"),
+        (["elbo", "--runs", "a", "--index", "3"], "--index: is an option of beliefs"),
         (["list", "--runs", "a"], "forbes figures list: it draws nothing, so it has no options"),
         ([], "forbes figures: the following arguments are required: NAME. See forbes figures --help"),
     ],

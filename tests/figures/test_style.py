@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
+from forbes.beliefs import GaussianBelief
+from forbes.callbacks.picture import colour_of
 from forbes.figures.style import METHODS, method_styles, method_title
+from forbes.training.loading import load_run
 
 TOGETHER = [name for name in METHODS if name != "Dreamer"]  # which is the RSSM's agent, and never next to the RSSM
 
@@ -94,3 +97,10 @@ def test_more_methods_than_styles_repeat_the_unused_ones():
     styles = method_styles(["FORBES", *names])
 
     assert METHODS["FORBES"] not in [styles[name] for name in names]
+
+
+def test_a_model_has_the_colour_of_its_family_while_it_trains(tiny_run):
+    module, _ = load_run(tiny_run)
+    assert colour_of(module.model) == METHODS["FORBES"].colour
+    module.model.posterior = module.model.prior = GaussianBelief(2, 4)
+    assert colour_of(module.model) == METHODS["RSSM"].colour
