@@ -23,7 +23,7 @@ from forbes.figures.returns import join_seeds
 from forbes.figures.style import BLACK, COLUMN, GREY, METHODS, PAGE, Method, draw_range, method_styles, paper_style
 
 __all__ = ["PAPER_TASKS", "draw_layers", "draw_returns", "draw_returns_1m", "draw_trajectories", "draw_trajectories_n"]
-__all__ += ["summaries", "variant_styles"]
+__all__ += ["summarise_returns", "variant_styles"]
 
 PAPER_TASKS = ("cartpole_swingup", "finger_spin", "cheetah_run", "walker_walk", "walker_run", "hopper_stand")
 """Tasks of Figure 6, in its order."""
@@ -60,10 +60,10 @@ def draw_returns_1m(runs: Sequence[str]) -> dict[str, Figure]:
 
 def _returns(runs: Sequence[str], limit: int) -> Figure:
     agents = _read([read_run(path) for path in runs], limit)
+    for title, summary in _summaries(agents).items():
+        print(title, *summary.lines(), sep="\n")
     if any(task in PAPER_TASKS for task in agents):
         agents = {task: agents.get(task, {}) for task in (*PAPER_TASKS, *agents)}
-    for title, summary in summaries(agents).items():
-        print(title, *summary.lines(), sep="\n")
     return _draw(agents, published=True)
 
 
@@ -105,10 +105,12 @@ def _is_papers(run: RecordedRun) -> bool:
 
 
 def _with_fewest_layers(runs: Sequence[str]) -> list[RecordedRun]:
-    """Return the runs without those of the ablation of layers."""
+    """Return the runs without those of the ablation of layers: of each method those with the fewest."""
     recorded = [read_run(path) for path in runs]
-    fewest = min(run.settings.get(LAYERS, 0) for run in recorded)
-    return [run for run in recorded if run.settings.get(LAYERS, 0) == fewest]
+    layers: dict[str, list[int]] = {}
+    for run in recorded:
+        layers.setdefault(run.method, []).append(run.settings.get(LAYERS, 0))
+    return [run for run in recorded if run.settings.get(LAYERS, 0) == min(layers[run.method])]
 
 
 def _read(runs: Sequence[RecordedRun], limit: int, always: Collection[str] = ()) -> dict[str, dict[str, AgentCurves]]:
@@ -126,12 +128,19 @@ def _read(runs: Sequence[RecordedRun], limit: int, always: Collection[str] = ())
     return agents
 
 
-def summaries(agents: Mapping[str, Mapping[str, AgentCurves]]) -> dict[str, Summary]:
-    """Summarise the returns at the last step that all agents of a task have reached, with a title for each summary.
+def summarise_returns(runs: Sequence[str], limit: int = _LIMIT) -> dict[str, Summary]:
+    """Summarise the returns of runs at the last step, up to `limit`, that all agents of a task have reached.
 
     The tasks of DeepMind Control, whose returns share a scale, are summarised together, each other task by itself. A
-    task that not all methods have is left out.
+    task that not all methods have is left out. The key of each summary is its title.
+
+    Raises:
+        ForbesError: if a run has no measured returns, or the seeds of a method have no step in common.
     """
+    return _summaries(_read([read_run(path) for path in runs], limit))
+
+
+def _summaries(agents: Mapping[str, Mapping[str, AgentCurves]]) -> dict[str, Summary]:
     scores: dict[str, dict[str, dict[str, list[float]]]] = {}
     last = {task: _common_end(of_task) for task, of_task in agents.items() if of_task}
     for task, step in last.items():

@@ -108,7 +108,7 @@ def reconstructions(
         for name, colour, frames in rows
     ]
     bands[-1] = [bands[-1][0]._replace(labels=[f"t={time}" for time in times])]
-    bands[0] = [bands[0][0]._replace(title=f"predictions from t = {context} on")]
+    bands[0] = [bands[0][0]._replace(title=f"predictions after t = {context}")]
     return draw_bands(bands)
 
 

@@ -67,8 +67,10 @@ def draw_simcore(runs: Sequence[str], samples: int = 4, context: int = 15) -> di
     bands = []
     for family in group(trained):
         shown, changed = count_changes(family.runs[0], prefixes, classifiers)
-        print(f"{family.name}: {shown} % show a digit at {_EARLY} % of their way, {changed} % of these end as another")
-        title = f"{family.name}: {shown.mean:.0f} % show a digit early, {_share(changed)} of these end as another"
+        print(f"{family.name}: {shown} % of roll-outs show a digit at {_EARLY} % of their way, {changed} % change it")
+        title = (
+            f"{family.name}: {shown.mean:.0f} % of roll-outs show a digit early, {_share(changed)} of these change it"
+        )
         bands.append(_band(family.runs[0], family.style.colour, title, prefixes, place, samples, classifiers))
     figure = draw_bands([panels for panels, _ in bands])
     for axes, (_, digits) in zip(figure.axes[1::2], bands, strict=True):

@@ -18,6 +18,7 @@ from forbes.figures.agents import (
     draw_returns_1m,
     draw_trajectories,
     draw_trajectories_n,
+    summarise_returns,
     variant_styles,
 )
 from forbes.figures.returns import join_seeds
@@ -159,6 +160,14 @@ def test_an_ablation_shows_what_it_compares_and_nothing_else(draw, name, labels,
     assert len({to_hex(line(axes, label).get_color()) for label in labels}) == len(labels)
 
 
+def test_methods_may_have_different_numbers_of_layers(tmp_path):
+    """Only a method's own deeper variants belong to the ablation of layers."""
+    flat = write_agent(tmp_path / "flat", "hop", {10: 1}, "GaussianBelief", 1, layers=1)
+    deep = write_agent(tmp_path / "deep", "hop", {10: 2}, "FlowBelief", 4, layers=2)
+
+    assert legend(draw_trajectories([flat, deep])["trajectories"]) == ["Dreamer, N = 1", "FORBES, N = 4"]
+
+
 def test_the_first_variant_of_a_method_is_drawn_like_the_method():
     styles = variant_styles({"Dreamer, N = 1": "Dreamer", "FORBES": "FORBES", "Dreamer, N = 4": "Dreamer"})
 
@@ -186,6 +195,8 @@ def test_the_summary_compares_at_the_last_common_step(tmp_path, capsys):
     assert f"FORBES   {(100 + 200 + 8) / 3:.2f} [" in out
     assert f"Dreamer  {(150 + 7) / 2:.2f} [78.50, 78.50], 2 runs" in out  # one seed each has no spread
     assert "P(FORBES > Dreamer) = 0.75 [0.50, 1.00]" in out  # (0 + 1)/2 + 1, over two tasks
+    (title,) = summarise_returns(runs)
+    assert title in out
 
 
 def test_one_agent_is_not_summarised(agents, capsys):

@@ -37,7 +37,7 @@ def test_the_truth_is_above_each_models_reconstruction_and_prediction(runs):
     models = ["FORBES", "FORBES,\npredicted", "RSSM", "RSSM,\npredicted", "Vector,\npredicted"]
     assert rows(figure) == ["truth", *models]
     assert [text.get_text() for text in figure.axes[-1].get_xticklabels()] == [f"t={time}" for time in range(1, 7)]
-    assert figure.axes[0].get_title() == "predictions from t = 2 on"
+    assert figure.axes[0].get_title() == "predictions after t = 2"
     for axes in figure.axes:
         assert axes.images[0].get_array().shape == (28 + 4, 6 * 30 + 2, 3)
 
