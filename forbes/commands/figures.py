@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Sequence
 
+from rich import box
 from rich.table import Table
 
 from forbes.commands.console import console
@@ -34,7 +35,7 @@ def _given(args: argparse.Namespace) -> dict[str, object]:
 
 def _table() -> Table:
     """Return the table of all figures."""
-    table = Table(title="forbes figures NAME --runs RUN RUN -o figures", title_justify="left")
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for header in ("name", "paper", "shows", "from runs of"):
         table.add_column(header, overflow="fold", no_wrap=header in ("name", "paper"))
     for figure in FIGURES:

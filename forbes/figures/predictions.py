@@ -24,7 +24,7 @@ _SHOWN = 10
 def draw_predictions(
     runs: Sequence[str], index: Sequence[int] = (), samples: int = 6, mean: bool = False, context: int = 15
 ) -> dict[str, Figure]:
-    """Draw `predictions`, at the last step of the data's length and at the end of the longest sequence shown.
+    """Draw `predictions` at the last step of the data's length, and for digit strokes at the end of the longest shown.
 
     Args:
         runs: run folders of image data. Of runs that differ only in the seed, the first is drawn.
@@ -49,7 +49,9 @@ def draw_predictions(
     data = trained[0].data
     if not context < data.length:
         raise ForbesError(f"--context {context}: expected less than the length of the sequences, {data.length}")
-    batch = whole_sequences(data, "test", _chosen(data, index, context))
+    chosen = _chosen(data, index, context)
+    whole = isinstance(data.source, Strokes)
+    batch = whole_sequences(data, "test", chosen) if whole else data.sequences("test", chosen)
     families = group(trained)
     return {
         f"predictions-t{time}": predictions(families, data.source, batch, time, context, samples, mean)

@@ -37,7 +37,7 @@ assert not {"torch", "matplotlib", "pandas"} & sys.modules.keys()
 
     assert max(map(len, told.splitlines())) <= 80
     for figure in FIGURES:
-        assert f"│ {figure.name} " in told
+        assert f" {figure.name} " in told
 
 
 def test_names_and_numbers_are_found_once():
