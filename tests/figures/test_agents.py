@@ -143,6 +143,19 @@ def test_the_appendix_goes_on_to_a_million_steps(agents):
     assert whole.get_xlim()[1] == pytest.approx(1.02 * 900_000)
 
 
+def test_other_tasks_are_drawn_to_their_end(agents, tmp_path):
+    gym = write_agent(tmp_path / "gym", "gymnasium:Walk-v1", {1_000: 3, 2_000_000: 4_000})
+    hike = write_agent(tmp_path / "hike", "mountain_hike", {10: -100, 20: -90})
+
+    shown = panels(only(draw_returns([agents["forbes"], gym, hike]), "returns"))
+
+    assert list(shown) == [*PAPER_TASKS, "gymnasium:Walk-v1", "mountain_hike"]
+    ends = {task: axes.get_xlim()[1] / 1.02 for task, axes in shown.items()}
+    assert ends["gymnasium:Walk-v1"] == pytest.approx(2_000_000)
+    assert ends["mountain_hike"] == pytest.approx(20)
+    assert ends["walker_run"] == pytest.approx(500_000)
+
+
 @pytest.mark.parametrize(
     ("draw", "name", "labels"),
     [
@@ -217,11 +230,15 @@ def test_a_run_that_was_trained_is_drawn(tmp_path, capsys):
 
 def test_what_cannot_be_drawn_is_one_sentence(agents, tmp_path, capsys):
     world = write_run(tmp_path / "world", "WorldModel", "FlowBelief", "Strokes", {}, [{"update": 1}])
-    apart = [write_agent(tmp_path / f"seed-{seed}", "hop", {10 + seed: 3}, seed=seed) for seed in (0, 1)]
+    apart, late = (
+        [write_agent(tmp_path / f"{task}-{seed}", task, {10 + seed: 3}, seed=seed) for seed in (0, 1)]
+        for task in ("hop", "walker_run")
+    )
     for name, runs, sentence in [
         ("returns", [str(tmp_path / "absent")], "absent: not a run folder, config.yaml is missing"),
         ("returns", [world], "metrics.jsonl has no return/acting"),
-        ("returns", apart, "FORBES on hop: no step up to 500,000 was reached by all its 2 seeds. Train them further"),
+        ("returns", apart, "FORBES on hop: no step was reached by all its 2 seeds. Train them further"),
+        ("returns", late, "FORBES on walker_run: no step up to 500,000 was reached by all its 2 seeds. Train them"),
         ("layers", [agents["planet"]], "--runs: none is an agent of Dreamer with N = 1, or FORBES with N = 4"),
         ("trajectories-n", [agents["dreamer"]], "--runs: none is an agent of FORBES, which this figure compares"),
     ]:
