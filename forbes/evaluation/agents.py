@@ -108,7 +108,8 @@ def evaluate_agents(
 def summarise_agents(played: Sequence[PlayedAgent]) -> Summary | None:
     """Summarise the mean return of each run over the seeds of each method; None unless there are seeds and methods."""
     means = {one.run: one.returns.mean().item() for one in played}
-    ((task, methods),) = group_by_method([read_run(run) for run in means]).items()
+    task = played[0].environment["task"]
+    methods = group_by_method([read_run(run)._replace(task=task) for run in means])[task]
     if len(methods) == len(played):
         return None
     return summarise({title: {task: [means[run.path] for run in runs]} for title, runs in methods.items()})

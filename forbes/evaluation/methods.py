@@ -39,6 +39,11 @@ class RecordedRun(NamedTuple):
     config: dict[str, Any]
     """Sections `model` and `data` of config.yaml without seeds: equal for runs that differ only in the seed."""
 
+    @property
+    def source(self) -> str:
+        """Class of the source of its data."""
+        return _class(_part(self.config, "data", "init_args", "source"))
+
 
 def read_run(path: str) -> RecordedRun:
     """Read the configuration of a run.
@@ -82,7 +87,8 @@ def _task(arguments: dict[str, Any]) -> str:
     options = _part(source, "init_args")
     if "task" in options:
         return str(options["task"])
-    return Path(options["path"]).name if options.get("path") else _class(source)
+    path = options.get("path")
+    return Path(path).name.removesuffix(".npz") if path else _class(source)
 
 
 def _part(section: dict[str, Any], *names: str) -> dict[str, Any]:

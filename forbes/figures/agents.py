@@ -23,7 +23,7 @@ from forbes.figures.returns import join_seeds
 from forbes.figures.style import BLACK, COLUMN, GREY, METHODS, PAGE, Method, draw_range, method_styles, paper_style
 
 __all__ = ["PAPER_TASKS", "draw_layers", "draw_returns", "draw_returns_1m", "draw_trajectories", "draw_trajectories_n"]
-__all__ += ["summaries", "variant_styles"]
+__all__ += ["summarise_returns", "variant_styles"]
 
 PAPER_TASKS = ("cartpole_swingup", "finger_spin", "cheetah_run", "walker_walk", "walker_run", "hopper_stand")
 """Tasks of Figure 6, in its order."""
@@ -45,7 +45,8 @@ class AgentCurves(NamedTuple):
 def draw_returns(runs: Sequence[str]) -> dict[str, Figure]:
     """Draw Figure 6, returns up to 500,000 env steps, and print their summary.
 
-    If a run has one of the paper's tasks, there is a panel for each of the six. A panel without a run says so.
+    If a run has one of the paper's tasks, there is a panel for each of the six. A panel without a run says so. The
+    returns of tasks that are not of DeepMind Control are drawn to their end.
 
     Raises:
         ForbesError: if a run has no measured returns, or the seeds of a method have no step in common.
@@ -60,10 +61,10 @@ def draw_returns_1m(runs: Sequence[str]) -> dict[str, Figure]:
 
 def _returns(runs: Sequence[str], limit: int) -> Figure:
     agents = _read([read_run(path) for path in runs], limit)
+    for title, summary in _summaries(agents).items():
+        print(title, *summary.lines(), sep="\n")
     if any(task in PAPER_TASKS for task in agents):
         agents = {task: agents.get(task, {}) for task in (*PAPER_TASKS, *agents)}
-    for title, summary in summaries(agents).items():
-        print(title, *summary.lines(), sep="\n")
     return _draw(agents, published=True)
 
 
@@ -105,37 +106,52 @@ def _is_papers(run: RecordedRun) -> bool:
 
 
 def _with_fewest_layers(runs: Sequence[str]) -> list[RecordedRun]:
-    """Return the runs without those of the ablation of layers."""
+    """Return the runs without those of the ablation of layers: of each method those with the fewest."""
     recorded = [read_run(path) for path in runs]
-    fewest = min(run.settings.get(LAYERS, 0) for run in recorded)
-    return [run for run in recorded if run.settings.get(LAYERS, 0) == fewest]
+    layers: dict[str, list[int]] = {}
+    for run in recorded:
+        layers.setdefault(run.method, []).append(run.settings.get(LAYERS, 0))
+    return [run for run in recorded if run.settings.get(LAYERS, 0) == min(layers[run.method])]
 
 
 def _read(runs: Sequence[RecordedRun], limit: int, always: Collection[str] = ()) -> dict[str, dict[str, AgentCurves]]:
-    """Return the agents by task and title, up to a number of env steps."""
+    """Return the agents by task and title, on DeepMind Control up to a number of env steps."""
     agents: dict[str, dict[str, AgentCurves]] = {}
     for task, of_task in group_by_method(runs, always).items():
+        cut = slice(limit) if _is_control(task) else slice(None)
         for title, of_one in of_task.items():
-            curves = [returns_of(run).loc[:limit] for run in of_one]
+            curves = [returns_of(run).loc[cut] for run in of_one]
             if join_seeds(curves).empty:
+                upto = f" up to {limit:,}" if _is_control(task) else ""
                 raise ForbesError(
-                    f"{title} on {task}: no step up to {limit:,} was reached by all its {len(curves)} seeds. "
-                    "Train them further"
+                    f"{title} on {task}: no step{upto} was reached by all its {len(curves)} seeds. Train them further"
                 )
             agents.setdefault(task, {})[title] = AgentCurves(of_one[0].method, curves)
     return agents
 
 
-def summaries(agents: Mapping[str, Mapping[str, AgentCurves]]) -> dict[str, Summary]:
-    """Summarise the returns at the last step that all agents of a task have reached, with a title for each summary.
+def _is_control(task: str) -> bool:
+    """Return whether a task is one of DeepMind Control, whose returns are at most 1,000."""
+    return len(published_returns(task)) > 0
+
+
+def summarise_returns(runs: Sequence[str], limit: int = _LIMIT) -> dict[str, Summary]:
+    """Summarise the returns of runs at the last step, up to `limit`, that all agents of a task have reached.
 
     The tasks of DeepMind Control, whose returns share a scale, are summarised together, each other task by itself. A
-    task that not all methods have is left out.
+    task that not all methods have is left out. The key of each summary is its title.
+
+    Raises:
+        ForbesError: if a run has no measured returns, or the seeds of a method have no step in common.
     """
+    return _summaries(_read([read_run(path) for path in runs], limit))
+
+
+def _summaries(agents: Mapping[str, Mapping[str, AgentCurves]]) -> dict[str, Summary]:
     scores: dict[str, dict[str, dict[str, list[float]]]] = {}
     last = {task: _common_end(of_task) for task, of_task in agents.items() if of_task}
     for task, step in last.items():
-        scale = "DeepMind Control" if len(published_returns(task)) else task
+        scale = "DeepMind Control" if _is_control(task) else task
         for title, one in agents[task].items():
             values = [float(np.interp(step, curve.index, curve)) for curve in one.curves]
             scores.setdefault(scale, {}).setdefault(title, {})[task] = values
@@ -153,8 +169,8 @@ def _common_end(of_task: Mapping[str, AgentCurves]) -> float:
 
 
 def _draw(agents: Mapping[str, Mapping[str, AgentCurves]], published: bool = False) -> Figure:
-    """Draw a panel per task: mean and range over seeds of each agent, up to the last step of any."""
-    end = max(curve.index.max() for of_task in agents.values() for one in of_task.values() for curve in one.curves)
+    """Draw a panel per task: mean and range over seeds of each agent."""
+    ends = _ends(agents)
     styles = variant_styles({title: one.method for of_task in agents.values() for title, one in of_task.items()})
     columns = min(3, len(agents))
     rows = math.ceil(len(agents) / columns)
@@ -164,16 +180,26 @@ def _draw(agents: Mapping[str, Mapping[str, AgentCurves]], published: bool = Fal
         panels = figure.subplots(rows, columns, squeeze=False).flat
         for axes, (task, of_task) in zip(panels, agents.items(), strict=False):
             if published:
-                _draw_published(axes, task, end)
+                _draw_published(axes, task, ends[task])
             for title, one in of_task.items():
                 draw_range(axes, join_seeds(one.curves), styles[title], _label(title, agents))
-            _label_panel(axes, task, end, empty=not of_task)
+            _label_panel(axes, task, ends[task], empty=not of_task)
         for axes in panels[len(agents) :]:
             axes.remove()
         figure.supylabel("return per episode", fontsize=8)
         figure.supxlabel("env steps (frames)", fontsize=8)
         _draw_legend(figure, [_label(title, agents) for title in styles], columns)
     return figure
+
+
+def _ends(agents: Mapping[str, Mapping[str, AgentCurves]]) -> dict[str, float]:
+    """Return the last step of each panel: the last of any agent, on all tasks of DeepMind Control the same."""
+    last = {
+        task: max((float(curve.index.max()) for one in of_task.values() for curve in one.curves), default=0.0)
+        for task, of_task in agents.items()
+    }
+    of_control = max((end for task, end in last.items() if _is_control(task)), default=0.0)
+    return {task: of_control if _is_control(task) else end for task, end in last.items()}
 
 
 def _draw_legend(figure: Figure, first: Sequence[str], columns: int) -> None:
@@ -214,7 +240,7 @@ def _label_panel(axes: Axes, task: str, end: float, empty: bool) -> None:
     axes.set_xlim(0, 1.02 * end)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
     axes.locator_params("x", nbins=5)
-    if len(published_returns(task)):
+    if _is_control(task):
         axes.set_ylim(0, 1.02 * _MOST)
     if empty:
         above = {"facecolor": "white", "edgecolor": "none", "pad": 2}

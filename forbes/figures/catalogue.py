@@ -41,10 +41,19 @@ FIGURES = (
     _Entry("prequential", "ours", "log p(o_t | past)", "world models, evaluated", "scores:draw_prequential"),
     _Entry("calibration", "ours", "ranks of states, coverage", "world models", "calibration:draw_calibration"),
     _Entry("returns", "6", "returns against env steps", "agents", "agents:draw_returns"),
-    _Entry("returns-1m", "appendix", "the same up to 1M env steps", "agents", "agents:draw_returns_1m"),
-    _Entry("trajectories", "7", "Dreamer, N = 1 and 4, and FORBES", "agents", "agents:draw_trajectories"),
+    _Entry("returns-1m", "appendix", "up to a million env steps", "agents", "agents:draw_returns_1m"),
+    _Entry("trajectories", "7", "Dreamer, N = 1, 4; FORBES", "agents", "agents:draw_trajectories"),
     _Entry("trajectories-n", "appendix", "FORBES with N = 1, 2 and 4", "agents", "agents:draw_trajectories_n"),
     _Entry("layers", "appendix", "Dreamer with more layers", "agents", "agents:draw_layers"),
+    _Entry("dmc-elbo", "appendix", "ELBO of stored episodes", "episodes, or agents", "dmc_elbo:draw_dmc_elbo"),
+    _Entry(
+        *("reconstructions", "appendix", "ten frames, truth, models", "images"),
+        *("reconstructions:draw_reconstructions", ("index", "context")),
+    ),
+    _Entry(
+        *("simcore", "appendix", "do roll-outs keep a digit?", "strokes"),
+        *("simcore:draw_simcore", ("samples", "context")),
+    ),
 )
 """The figures, in the order of the paper."""
 

@@ -18,6 +18,7 @@ from forbes.figures.agents import (
     draw_returns_1m,
     draw_trajectories,
     draw_trajectories_n,
+    summarise_returns,
     variant_styles,
 )
 from forbes.figures.returns import join_seeds
@@ -142,6 +143,19 @@ def test_the_appendix_goes_on_to_a_million_steps(agents):
     assert whole.get_xlim()[1] == pytest.approx(1.02 * 900_000)
 
 
+def test_other_tasks_are_drawn_to_their_end(agents, tmp_path):
+    gym = write_agent(tmp_path / "gym", "gymnasium:Walk-v1", {1_000: 3, 2_000_000: 4_000})
+    hike = write_agent(tmp_path / "hike", "mountain_hike", {10: -100, 20: -90})
+
+    shown = panels(only(draw_returns([agents["forbes"], gym, hike]), "returns"))
+
+    assert list(shown) == [*PAPER_TASKS, "gymnasium:Walk-v1", "mountain_hike"]
+    ends = {task: axes.get_xlim()[1] / 1.02 for task, axes in shown.items()}
+    assert ends["gymnasium:Walk-v1"] == pytest.approx(2_000_000)
+    assert ends["mountain_hike"] == pytest.approx(20)
+    assert ends["walker_run"] == pytest.approx(500_000)
+
+
 @pytest.mark.parametrize(
     ("draw", "name", "labels"),
     [
@@ -157,6 +171,14 @@ def test_an_ablation_shows_what_it_compares_and_nothing_else(draw, name, labels,
     assert list(panels(figure)) == ["walker_walk"]  # there is nothing to compare on walker_run
     (axes,) = figure.axes
     assert len({to_hex(line(axes, label).get_color()) for label in labels}) == len(labels)
+
+
+def test_methods_may_have_different_numbers_of_layers(tmp_path):
+    """Only a method's own deeper variants belong to the ablation of layers."""
+    flat = write_agent(tmp_path / "flat", "hop", {10: 1}, "GaussianBelief", 1, layers=1)
+    deep = write_agent(tmp_path / "deep", "hop", {10: 2}, "FlowBelief", 4, layers=2)
+
+    assert legend(draw_trajectories([flat, deep])["trajectories"]) == ["Dreamer, N = 1", "FORBES, N = 4"]
 
 
 def test_the_first_variant_of_a_method_is_drawn_like_the_method():
@@ -186,6 +208,8 @@ def test_the_summary_compares_at_the_last_common_step(tmp_path, capsys):
     assert f"FORBES   {(100 + 200 + 8) / 3:.2f} [" in out
     assert f"Dreamer  {(150 + 7) / 2:.2f} [78.50, 78.50], 2 runs" in out  # one seed each has no spread
     assert "P(FORBES > Dreamer) = 0.75 [0.50, 1.00]" in out  # (0 + 1)/2 + 1, over two tasks
+    (title,) = summarise_returns(runs)
+    assert title in out
 
 
 def test_one_agent_is_not_summarised(agents, capsys):
@@ -206,11 +230,15 @@ def test_a_run_that_was_trained_is_drawn(tmp_path, capsys):
 
 def test_what_cannot_be_drawn_is_one_sentence(agents, tmp_path, capsys):
     world = write_run(tmp_path / "world", "WorldModel", "FlowBelief", "Strokes", {}, [{"update": 1}])
-    apart = [write_agent(tmp_path / f"seed-{seed}", "hop", {10 + seed: 3}, seed=seed) for seed in (0, 1)]
+    apart, late = (
+        [write_agent(tmp_path / f"{task}-{seed}", task, {10 + seed: 3}, seed=seed) for seed in (0, 1)]
+        for task in ("hop", "walker_run")
+    )
     for name, runs, sentence in [
         ("returns", [str(tmp_path / "absent")], "absent: not a run folder, config.yaml is missing"),
         ("returns", [world], "metrics.jsonl has no return/acting"),
-        ("returns", apart, "FORBES on hop: no step up to 500,000 was reached by all its 2 seeds. Train them further"),
+        ("returns", apart, "FORBES on hop: no step was reached by all its 2 seeds. Train them further"),
+        ("returns", late, "FORBES on walker_run: no step up to 500,000 was reached by all its 2 seeds. Train them"),
         ("layers", [agents["planet"]], "--runs: none is an agent of Dreamer with N = 1, or FORBES with N = 4"),
         ("trajectories-n", [agents["dreamer"]], "--runs: none is an agent of FORBES, which this figure compares"),
     ]:

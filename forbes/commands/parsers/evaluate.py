@@ -41,6 +41,8 @@ Agents play the same --episodes without exploration; their score is the return. 
 - the KL of prior and posterior from the nearest Gaussian (near 0 = a Gaussian would do as well);
 - if the exact belief is known, the variance of the reward under the agent's belief divided by that under the exact one
   (near 0 = all belief samples agree).
+For several seeds of several agents it also prints the interquartile mean over seeds with a bootstrap interval, and the
+probability that a seed of one agent earns more than one of another (arXiv 2108.13264).
 Results are saved per agent; an interrupted evaluation starts over.
 
 With --acting-samples 32 an agent takes the mean action (discrete: the most frequent) of 32 belief samples instead of

@@ -32,11 +32,11 @@ def parser() -> ArgumentParser:
     command.add_argument("-o", "--output", type=Path, default=Path("figures"), help="output folder (default: figures)")
     some = command.add_argument_group("options of some figures")
     some.add_argument("--index", type=int, nargs="+", help="indices of the test sequences to draw")
-    some.add_argument("--samples", type=positive, help="completions of each sequence (predictions: 6)")
+    some.add_argument("--samples", type=positive, help="completions of each sequence (predictions: 6, simcore: 4)")
     some.add_argument(
         "--mean", action="store_true", default=None, help="draw pixel probabilities of written strokes, not samples"
     )
-    some.add_argument("--context", type=positive, help="frames that the models see (predictions: 15)")
+    some.add_argument("--context", type=positive, help="frames that the models see (15; reconstructions: 5)")
     return command
 
 

@@ -36,8 +36,16 @@ from forbes.evaluation.scores import Increments
 from forbes.evaluation.scoring import Scorer
 from forbes.models import BeliefModel
 
-__all__ = ["Prefixes", "model_scorer", "neighbour_scorer", "score_completions", "select_prefixes", "summarise"]
-__all__ += ["summarise_classes", "truth_scorer"]
+__all__ = [
+    "Prefixes",
+    "classes_at",
+    "model_scorer",
+    "neighbour_scorer",
+    "score_completions",
+    "select_prefixes",
+    "summarise",
+]
+__all__ += ["summarise", "summarise_classes", "truth_scorer"]
 
 _SHARES = (60, 80)
 """Percentages of the remaining steps after which a completion's class is compared with its final class."""
@@ -179,7 +187,7 @@ def score_completions(
     values = {"clear": _is_clear(classes).mean(0), "grey": grey_ink(means).mean(0)}
     for share in _SHARES:
         step = context + (share * (end - context) / 100).ceil().long()  # (B,)
-        before = _classes_at(frames, batch, context, step, classifiers.prefix)  # (N, B, 10)
+        before = classes_at(frames, batch.observation, context, step, classifiers.prefix)  # (N, B, 10)
         early, same = _is_clear(before), before.argmax(-1) == classes.argmax(-1)  # (N, B), (N, B)
         values |= {f"early {share}": early.mean(0), f"kept {share}": (early * same).mean(0)}
     for name, step in (("trained", end.clamp(max=length)), ("end", end)):
@@ -200,13 +208,11 @@ def _is_clear(classes: Tensor) -> Tensor:
     return (classes.amax(-1) > _CLEAR).double()  # (N, B)
 
 
-def _classes_at(
-    frames: Tensor, batch: SequenceBatch, context: int, step: Tensor, classifier: DigitClassifier
-) -> Tensor:
+def classes_at(frames: Tensor, observation: Tensor, context: int, step: Tensor, classifier: DigitClassifier) -> Tensor:
     """Classify each completion up to one step of each digit, `(B,)`, as an unfinished digit: `(N, B, 10)`."""
     drawn = torch.arange(context + 1, context + 1 + frames.shape[2]) <= step[:, None]  # (B, T - c)
     rolled = drawn[:, None].to(frames.dtype) @ frames.flatten(3)  # (N, B, 1, P), the sum over the steps drawn
-    total = rolled.view(*frames.shape[:2], *frames.shape[3:]) + batch.observation[:, :context].sum(1)
+    total = rolled.view(*frames.shape[:2], *frames.shape[3:]) + observation[:, :context].sum(1)
     mean = total / step.view(-1, 1, 1, 1)  # (N, B, 1, H, W)
     last = frames[:, torch.arange(len(step)), step - context - 1]  # (N, B, 1, H, W)
     log_probs: Tensor = classifier(_history(last, mean))
