@@ -10,6 +10,7 @@ from torch.nn.functional import elu, relu
 
 from forbes.configured import Configurable
 from forbes.errors import ForbesError
+from forbes.performance.convolutions import convolve
 from forbes.performance.fusion import Elementwise
 from forbes.performance.recurrence import prepare_mlp
 from forbes.performance.time_loop import TimeLoop
@@ -191,11 +192,11 @@ class ConvEncoder(Encoder):
         blocks = [(nn.Conv2d(before, after, _KERNEL, stride=2), nn.ReLU()) for before, after in pairwise(widths)]
         self.net = nn.Sequential(*chain(*blocks))
         self.embedding_dim = widths[-1] * math.prod(sides)
+        self.pixels = math.prod(observation_shape[1:])
 
     def forward(self, observation: Tensor) -> Tensor:
         """See `Encoder`."""
-        maps: Tensor = self.net(observation)
-        return maps.flatten(1)  # (N, E)
+        return convolve(self.net, observation, self.pixels).flatten(1)  # (N, E)
 
 
 class ConvDecoder(Decoder):
@@ -241,11 +242,12 @@ class ConvDecoder(Decoder):
             nn.init.constant_(convolutions[-1].get_parameter("bias"), output_bias)
         blocks = [block for convolution in convolutions for block in (convolution, nn.ReLU())]
         self.net = nn.Sequential(*blocks[:-1])
+        self.pixels = math.prod(sides)
 
     def forward(self, features: Tensor) -> Tensor:
         """See `Decoder`."""
-        output: Tensor = self.net(self.start(features).unflatten(-1, self.start_shape))  # (N, C, H, W)
-        return output
+        start = self.start(features).unflatten(-1, self.start_shape)  # (N, C_0, H_0, W_0)
+        return convolve(self.net, start, self.pixels)  # (N, C, H, W)
 
 
 def transposed_kernels(first: int, last: int, layers: int) -> list[int]:

@@ -4,5 +4,6 @@
 - `recurrence`: the MLPs and the GRU of a filter in such a loop.
 - `flow_loop`: the conditional flow in such a loop, with merged layers.
 - `fusion`: elementwise operations fused into one kernel where an update is recorded for a GPU.
+- `convolutions`: the convolutions of many frames on a CPU.
 - `precision`: what stays in float32 in a mixed-precision training.
 """

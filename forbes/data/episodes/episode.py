@@ -1,7 +1,7 @@
-"""An episode and its file: an uncompressed `.npz`, readable by `numpy.load`, and memory-mapped here.
+"""An episode and its file: an uncompressed `.npz`, readable by `numpy.load`.
 
-A member of an uncompressed archive is the bytes of an array at some offset. Reading a segment touches only its pages:
-the archive is neither copied nor unpacked, and the system may evict the pages again.
+A member of an uncompressed archive is the bytes of an array at some offset. A segment is therefore read from the file
+without unpacking the archive, and a whole episode is memory-mapped.
 """
 
 import hashlib
@@ -9,11 +9,12 @@ import io
 import json
 import math
 import mmap
+import os
 import struct
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,8 @@ from forbes.errors import ForbesError
 from forbes.reading import is_number, readable, shortened
 from forbes.shapes import printed_by_shape
 
-__all__ = ["DamagedEpisodeError", "Episode", "EpisodeRecord", "map_episode", "pack_episode"]
-__all__ += ["problem_of", "problem_with", "read_record"]
+__all__ = ["DamagedEpisodeError", "Episode", "EpisodeFile", "EpisodeRecord", "Stamp", "locate_episode", "map_episode"]
+__all__ += ["pack_episode", "problem_of", "problem_with", "read_record", "stamp_of"]
 
 _ARRAYS = ("observation", "action", "reward")
 _SHOWN = 60  # characters of an invalid value in an error message
@@ -171,37 +172,91 @@ def pack_episode(episode: Episode, about: dict[str, Any]) -> bytes:
     return content.getvalue()
 
 
-def map_episode(path: Path, record: EpisodeRecord, verify: bool) -> Episode:
+Stamp: TypeAlias = tuple[int, int, int, int]
+"""Bytes, time of the last write, time of the last change, and inode of a file. Every write changes it."""
+
+
+class StoredArray(NamedTuple):
+    """Where an array is in a file."""
+
+    offset: int
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+
+    def view(self, mapped: mmap.mmap) -> NDArray[Any]:
+        """Return a view of the mapped file."""
+        return np.frombuffer(mapped, self.dtype, math.prod(self.shape), self.offset).reshape(self.shape)
+
+
+class EpisodeFile(NamedTuple):
+    """Where the arrays of an episode are in its file, and when the file was checked."""
+
+    stamp: Stamp
+    arrays: tuple[StoredArray, ...]
+    """Those of observation, action and reward."""
+
+    def read(self, file: io.FileIO, start: int, into: Sequence[NDArray[Any]]) -> bool:
+        """Read the steps from `start` on into contiguous arrays of the same length, one for each of ours.
+
+        Returns:
+            Whether the file had all of them.
+        """
+        whole = True
+        for array, steps in zip(self.arrays, into, strict=True):
+            file.seek(array.offset + start * array.dtype.itemsize * math.prod(array.shape[1:]))
+            whole &= file.readinto(steps.view(np.uint8).data) == steps.nbytes
+        return whole
+
+
+def stamp_of(file: io.FileIO) -> Stamp:
+    """Return the stamp of an open file."""
+    found = os.fstat(file.fileno())
+    return found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino
+
+
+def map_episode(path: Path, record: EpisodeRecord, verified: Stamp | None = None) -> Episode:
     """Memory-map an episode. Its arrays are views of the mapped file, and keep it open.
 
     Args:
         path: file of the episode.
         record: entry of the episode in the index.
-        verify: read the whole file, compare its hash, and check the arrays.
+        verified: stamp at which the file was last verified. If it has another one, the whole file is read, its hash
+            compared, and its arrays checked.
 
     Raises:
         DamagedEpisodeError: if the file does not match the record.
     """
+    return _open_episode(path, record, verified)[1]
+
+
+def locate_episode(path: Path, record: EpisodeRecord, verified: Stamp | None = None) -> EpisodeFile:
+    """Return where the arrays of an episode are, after the checks of `map_episode`."""
+    return _open_episode(path, record, verified)[0]
+
+
+def _open_episode(path: Path, record: EpisodeRecord, verified: Stamp | None) -> tuple[EpisodeFile, Episode]:
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", buffering=0) as file:
+            stamp = stamp_of(file)
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         if len(mapped) != record.size:
             raise ValueError(f"it has {len(mapped)} bytes, expected {record.size}")
-        if verify and hashlib.sha256(mapped).hexdigest() != record.sha256:
+        if stamp != verified and hashlib.sha256(mapped).hexdigest() != record.sha256:
             raise ValueError("its sha256 is not that of the index")
         with zipfile.ZipFile(path) as archive:
-            observation, action, reward = (_view(mapped, archive.getinfo(f"{name}.npy")) for name in _ARRAYS)
+            arrays = tuple(_locate(mapped, archive.getinfo(f"{name}.npy")) for name in _ARRAYS)
+        observation, action, reward = (array.view(mapped) for array in arrays)
     except FileNotFoundError as error:
         raise DamagedEpisodeError(path, "it is missing") from error
     except (KeyError, ValueError, struct.error, zipfile.BadZipFile) as error:
         raise DamagedEpisodeError(path, str(error.args[0])) from error
     episode = Episode(observation, action, reward, record.terminated, record.frames)
-    problem = (verify and problem_of(episode)) or problem_with(record.environment, episode)
+    problem = (stamp != verified and problem_of(episode)) or problem_with(record.environment, episode)
     if not problem and len(reward) != record.steps + 1:
         problem = f"it has {len(reward) - 1} steps, expected {record.steps}"
     if problem:
         raise DamagedEpisodeError(path, problem)
-    return episode
+    return EpisodeFile(stamp, arrays), episode
 
 
 def read_record(path: Path) -> EpisodeRecord:
@@ -219,12 +274,12 @@ def read_record(path: Path) -> EpisodeRecord:
         record = EpisodeRecord(**about, size=len(content), sha256=hashlib.sha256(content).hexdigest())
     if problem := record.problem():
         raise DamagedEpisodeError(path, problem)
-    map_episode(path, record, verify=True)
+    map_episode(path, record)
     return record
 
 
-def _view(mapped: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Return a view of an array in the archive, after the headers of the member and of the `.npy` format."""
+def _locate(mapped: mmap.mmap, member: zipfile.ZipInfo) -> StoredArray:
+    """Return where an array of the archive is: after the headers of the member and of the `.npy` format."""
     if member.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{member.filename} is compressed")
     name_length, extra_length = struct.unpack_from("<HH", mapped, member.header_offset + _LOCAL_HEADER - 4)
@@ -234,4 +289,4 @@ def _view(mapped: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
     shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(mapped)
     if dtype.hasobject or fortran_order:
         raise ValueError(f"{member.filename} has dtype object or column-major order")
-    return np.frombuffer(mapped, dtype, math.prod(shape), mapped.tell()).reshape(shape)
+    return StoredArray(mapped.tell(), dtype, shape)

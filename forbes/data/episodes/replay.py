@@ -1,14 +1,15 @@
-"""Stored episodes as training data: segments of fixed length, memory-mapped."""
+"""Stored episodes as training data: segments of fixed length."""
 
 import hashlib
 from collections.abc import Iterator
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from forbes.data.episodes.episode import Episode, EpisodeRecord
+from forbes.data.episodes.episode import EpisodeRecord
 from forbes.data.episodes.store import EpisodeStore, first_held
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError, require_at_least
@@ -35,25 +36,34 @@ class Segments(NamedTuple):
     """True on the last step of an episode that terminated, bool (B, T)."""
 
     @classmethod
-    def empty(cls, count: int, length: int, observation_shape: tuple[int, ...], action_dim: int) -> "Segments":
-        """Return `count` segments of padding."""
+    def unwritten(cls, count: int, length: int, observation_shape: tuple[int, ...], action_dim: int) -> "Segments":
+        """Return segments to be written to: their values are arbitrary, their masks False."""
         dtype = torch.uint8 if len(observation_shape) == 3 else torch.float32
         return cls(
-            observation=torch.zeros(count, length, *observation_shape, dtype=dtype),
-            action=torch.zeros(count, length, action_dim),
-            reward=torch.zeros(count, length),
+            observation=torch.empty(count, length, *observation_shape, dtype=dtype),
+            action=torch.empty(count, length, action_dim),
+            reward=torch.empty(count, length),
             mask=torch.zeros(count, length, dtype=torch.bool),
             ended=torch.zeros(count, length, dtype=torch.bool),
         )
 
-    def fill(self, row: int, episode: Episode, start: int) -> None:
-        """Copy the steps of an episode from `start` on to segment `row`."""
-        end = min(start + self.mask.shape[1], len(episode.reward))
-        steps, filled = slice(start, end), slice(0, end - start)
-        for name in ("observation", "action", "reward"):
-            getattr(self, name).numpy()[row, filled] = getattr(episode, name)[steps]
-        self.mask[row, filled] = True
-        self.ended[row, end - start - 1] = episode.terminated and end == len(episode.reward)
+    def begin(self, row: int, steps: int, ends: bool) -> list[NDArray[Any]]:
+        """Mark the first steps of a segment as steps and the others as padding.
+
+        Args:
+            row: number of the segment.
+            steps: number of its steps.
+            ends: whether the episode terminates with the last one.
+
+        Returns:
+            Observation, action and reward of the steps, as arrays to write to.
+        """
+        stored = (self.observation, self.action, self.reward)
+        for values in stored:
+            values[row, steps:] = 0
+        self.mask[row, :steps] = True
+        self.ended[row, steps - 1] = ends
+        return [values[row, :steps].numpy() for values in stored]
 
 
 class _Table(NamedTuple):
@@ -106,6 +116,7 @@ class Replay(SequenceSource):
         self.store = EpisodeStore(path)
         self.store.require_episodes()
         self._watermark = self.store.watermark
+        self._verified: set[Split] = set()
         environment = next(iter(self.store.records.values())).environment
         self.observation_shape: tuple[int, ...] = tuple(environment["observation_shape"])
         self.action_dim: int = environment["action_dim"]
@@ -129,6 +140,7 @@ class Replay(SequenceSource):
                 "Name the folder used in training"
             )
         self._watermark = value
+        self._verified.clear()
         self.__dict__.pop("_tables", None)
 
     def _held(self) -> list[EpisodeRecord]:
@@ -180,11 +192,17 @@ class Replay(SequenceSource):
         return (table.ends - table.lengths).flip(0)[:count]  # a training segment begins at every observation
 
     def gather(self, split: Split, index: Tensor, length: int) -> Segments:
-        """Return segments by index, int64 (B,), read from the mapped files."""
+        """Return segments by index, int64 (B,). Before the first one, the files of the split are verified."""
         require_at_least(1, "Replay", length=length)
-        segments = Segments.empty(len(index), length, self.observation_shape, self.action_dim)
+        if split not in self._verified:
+            self.store.verify(self._require(split).numbers)
+            self._verified.add(split)
+        segments = Segments.unwritten(len(index), length, self.observation_shape, self.action_dim)
         for row, (number, start) in enumerate(self._locate(split, index)):
-            segments.fill(row, self.store.episode(number), start)
+            record = self.store.records[number]
+            end = min(start + length, record.steps + 1)
+            ends = record.terminated and end == record.steps + 1
+            self.store.read(number, start, segments.begin(row, end - start, ends))
         return segments
 
     def _locate(self, split: Split, index: Tensor) -> Iterator[tuple[int, int]]:

@@ -5,6 +5,7 @@
     DIR/
       index.jsonl     one JSON object per line, appended and synced: an episode, or an event (`EpisodeIndex`)
       000000.npz …    one episode each, written to a temporary file, synced and renamed before its line is appended
+      verified.jsonl  which files were compared with their hashes, and when (`VerifiedFiles`); may be deleted
       set_aside/      episodes later than the checkpoint of a resumed run, and intact files that the index does not list
       quarantine/     damaged files
 
@@ -16,29 +17,38 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
 from forbes.data.episodes.episode import (
     DamagedEpisodeError,
     Episode,
+    EpisodeFile,
     EpisodeRecord,
+    locate_episode,
     map_episode,
     pack_episode,
     problem_of,
     problem_with,
     read_record,
+    stamp_of,
 )
 from forbes.data.episodes.index import EpisodeIndex
+from forbes.data.episodes.verified import VerifiedFiles
 from forbes.errors import ForbesError
 from forbes.files import drop_half_line, locked, remove_halves, replace_file
 
 __all__ = ["EpisodeStore", "EpisodeWriter", "first_held"]
 
-_OPEN_FILES = 256
-"""Maximal number of mapped episodes, each with an open file. Systems typically allow 1024 open files."""
+_SHOWN = 2**30
+"""Bytes to verify from which on a progress bar is shown, since they take a second."""
 
 
 class EpisodeStore:
@@ -54,8 +64,8 @@ class EpisodeStore:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self.index = EpisodeIndex(self.path / "index.jsonl")
-        self._verified: set[str] = set()
-        self._mapped: dict[tuple[int, str], Episode] = {}
+        self._verified = VerifiedFiles(self.path / "verified.jsonl")
+        self._files: dict[tuple[int, str], EpisodeFile] = {}
 
     @property
     def records(self) -> dict[int, EpisodeRecord]:
@@ -94,12 +104,6 @@ class EpisodeStore:
     def refresh(self) -> None:
         """Read the index again, since another process may have extended it."""
         self.index.refresh()
-        self._close_maps()
-
-    def _close_maps(self) -> None:
-        """Unmap episodes that are no longer in the index, so that their disk space is freed."""
-        listed = {(number, record.sha256) for number, record in self.records.items()}
-        self._mapped = {key: episode for key, episode in self._mapped.items() if key in listed}
 
     def file(self, number: int) -> Path:
         """Return the path of an episode's file."""
@@ -112,21 +116,65 @@ class EpisodeStore:
         return sorted(number for number in numbers if self.file(number).is_file())
 
     def episode(self, number: int) -> Episode:
-        """Memory-map an episode. Its hash is verified on the first access of this process.
+        """Memory-map an episode.
 
         Raises:
             DamagedEpisodeError: if the file does not match the index.
         """
         record = self.records[number]
-        key = number, record.sha256
-        episode = self._mapped.pop(key, None)
-        if episode is None:
-            episode = map_episode(self.file(number), record, verify=record.sha256 not in self._verified)
-            self._verified.add(record.sha256)
-            while len(self._mapped) >= _OPEN_FILES:
-                del self._mapped[next(iter(self._mapped))]  # the least recently used
-        self._mapped[key] = episode
-        return episode
+        return map_episode(self.file(number), record, self._verified.stamp(record.sha256))
+
+    def verify(self, numbers: Iterable[int]) -> None:
+        """Compare files with their hashes, unless they have not changed since they were last compared.
+
+        Raises:
+            DamagedEpisodeError: for the first file that does not match the index.
+        """
+        new = {number: self.records[number] for number in numbers if self._key(number) not in self._files}
+        unverified = [record for record in new.values() if self._verified.stamp(record.sha256) is None]
+        short = sum(record.size for record in unverified) < _SHOWN
+        console, total = Console(stderr=True), len(new)
+        with ThreadPoolExecutor() as pool:  # hashing and reading let other threads run
+            files = track(
+                pool.map(self._locate, new),
+                f"verifying {self.path}",
+                total,
+                disable=short,
+                console=console,
+                transient=True,
+            )
+            located = dict(zip(new, files, strict=True))
+        self._files |= {self._key(number): file for number, file in located.items()}
+        self._verified.add({new[number].sha256: file.stamp for number, file in located.items()})
+
+    def read(self, number: int, start: int, into: Sequence[NDArray[Any]]) -> None:
+        """Read steps of an episode. Its file is verified again if it has changed.
+
+        Args:
+            number: number of the episode.
+            start: the first step.
+            into: contiguous arrays for observation, action and reward, as long as the number of steps.
+
+        Raises:
+            DamagedEpisodeError: if the file does not match the index.
+        """
+        path, key = self.file(number), self._key(number)
+        try:
+            with open(path, "rb", buffering=0) as file:
+                if key not in self._files or self._files[key].stamp != stamp_of(file):
+                    self._files[key] = self._locate(number)
+                whole = self._files[key].read(file, start, into)
+        except FileNotFoundError as error:
+            raise DamagedEpisodeError(path, "it is missing") from error
+        if not whole:
+            raise DamagedEpisodeError(path, "it ended while it was read")
+
+    def _key(self, number: int) -> tuple[int, str]:
+        return number, self.records[number].sha256
+
+    def _locate(self, number: int) -> EpisodeFile:
+        record = self.records[number]
+        return locate_episode(self.file(number), record, self._verified.stamp(record.sha256))
 
 
 class EpisodeWriter(EpisodeStore):
@@ -255,14 +303,13 @@ class EpisodeWriter(EpisodeStore):
         found = {}
         for number, record in self.records.items():
             try:
-                map_episode(self.file(number), record, verify=True)
+                map_episode(self.file(number), record)
             except DamagedEpisodeError as error:
                 found[number] = error.reason
         return found
 
     def _tidy(self) -> None:
         """Move files that the index does not list to `set_aside/`, and delete those it has forgotten."""
-        self._close_maps()
         for number in self.files():
             if number < self.index.first:
                 self.file(number).unlink()

@@ -1,6 +1,7 @@
 """The episode store: what was stored stays whole, whatever happens to the process, the disk or a file."""
 
 import errno
+import hashlib
 import json
 import multiprocessing
 import os
@@ -9,7 +10,7 @@ import signal
 import numpy as np
 import pytest
 
-from forbes.data.episodes.episode import DamagedEpisodeError, Episode
+from forbes.data.episodes.episode import DamagedEpisodeError, Episode, map_episode, stamp_of
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter, first_held
 from forbes.errors import ForbesError
 
@@ -90,16 +91,25 @@ def test_a_reader_sees_added_episodes_after_a_refresh(store):
     assert_is(reader.episode(3), 3)
 
 
-def test_only_so_many_files_are_open_at_a_time(store, monkeypatch):
-    monkeypatch.setattr("forbes.data.episodes.store._OPEN_FILES", 2)
+def steps_of(opened, number):
+    """The episode as `EpisodeStore.read` gives it."""
+    record = opened.records[number]
+    arrays = [np.empty((record.steps + 1, *shape), np.float32) for shape in ((2,), (1,), ())]
+    opened.read(number, 0, arrays)
+    return Episode(*arrays, record.terminated, record.frames)
+
+
+def test_reading_keeps_no_file_open(store):
     with EpisodeWriter(store) as writer:
         for _ in range(9):
             append(writer)
-    opened, before = EpisodeStore(store), len(os.listdir("/proc/self/fd"))
+    opened, before = EpisodeStore(store), os.listdir("/proc/self/fd")
+    opened.verify(opened.records)
     for number in (*range(12), *range(12)):
-        assert_is(opened.episode(number), number)
+        assert_is(steps_of(opened, number), number)
 
-    assert len(os.listdir("/proc/self/fd")) - before <= 2
+    assert os.listdir("/proc/self/fd") == before
+    assert not mapped_files(store)
 
 
 def test_two_processes_never_write_to_one_store(store):
@@ -219,16 +229,16 @@ def mapped_files(path):
         return {line.split(maxsplit=5)[5].strip() for line in maps if str(path) in line}
 
 
-@pytest.mark.parametrize("of", ["the writer", "a reader"])
-def test_a_forgotten_episode_leaves_the_disk_though_it_was_open(store, of):
+def test_a_forgotten_episode_leaves_the_disk_though_it_was_read(store):
     with EpisodeWriter(store) as writer:
-        reader = writer if of == "the writer" else EpisodeStore(store)
-        assert all(reader.episode(number).reward[1] > 0 or number == 0 for number in range(3))
-        assert len(mapped_files(store)) == 3
+        reader = EpisodeStore(store)
+        for number in range(3):
+            assert_is(steps_of(reader, number), number)
         writer.forget(2)
         reader.refresh()
 
-    assert mapped_files(store) == {f"{store}/000002.npz"}
+    assert not mapped_files(store)
+    assert [path.name for path in store.glob("*.npz")] == ["000002.npz"]
 
 
 def test_names_that_the_store_does_not_give_are_left_alone(store):
@@ -271,6 +281,77 @@ def test_a_damaged_file_is_named_and_quarantined(store, damage):
     assert (store / "quarantine" / "000001.npz").is_file()
 
 
+@pytest.fixture
+def hashed(monkeypatch):
+    """The sizes of the files hashed so far."""
+    sizes = []
+    sha256 = hashlib.sha256
+
+    def count(content):
+        sizes.append(len(content))
+        return sha256(content)
+
+    monkeypatch.setattr("forbes.data.episodes.episode.hashlib.sha256", count)
+    return sizes
+
+
+def test_a_file_is_hashed_once_for_all_processes(store, hashed):
+    EpisodeStore(store).verify([0, 1])
+    assert len(hashed) == 2
+    again = EpisodeStore(store)
+    again.verify(again.records)
+    assert_is(steps_of(again, 1), 1)
+    assert_is(again.episode(0), 0)
+    assert len(hashed) == 3
+
+    with EpisodeWriter(store) as writer:
+        assert writer.damage() == {}  # `forbes data check` trusts no earlier look
+    assert len(hashed) == 6
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("when", ["before this process", "in this process"])
+def test_damage_after_a_check_is_found_before_a_step_is_used(store, damage, when):
+    reader = EpisodeStore(store)
+    reader.verify(reader.records)
+    assert_is(steps_of(reader, 1), 1)
+    path, before = store / "000001.npz", (store / "000001.npz").stat()
+    path.write_bytes(DAMAGE[damage](path.read_bytes()))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # as if it had not been written to
+
+    reader = EpisodeStore(store) if when == "before this process" else reader
+    with pytest.raises(DamagedEpisodeError, match=r"000001\.npz: damaged"):
+        steps_of(reader, 1)
+    with pytest.raises(DamagedEpisodeError, match=r"000001\.npz: damaged"):
+        EpisodeStore(store).verify([0, 1, 2])
+    assert_is(steps_of(reader, 2), 2)
+
+
+@pytest.mark.parametrize("content", ["", "nonsense", "[]", "3", '{"a": 1}', '{"a": ["x"]}', '{"a": [1, 2]}', "\0\0"])
+def test_a_damaged_list_of_verified_files_is_written_again(store, content, hashed):
+    EpisodeStore(store).verify([0, 1, 2])
+    (store / "verified.jsonl").write_text(content + "\n")
+    EpisodeStore(store).verify([0, 1, 2])
+    assert len(hashed) == 6
+    EpisodeStore(store).verify([0, 1, 2])
+    assert len(hashed) == 6
+
+
+def test_a_store_that_cannot_be_written_to_is_read(store, hashed, monkeypatch):
+    monkeypatch.setattr("forbes.data.episodes.verified.os.access", lambda path, mode: False)
+    EpisodeStore(store).verify([0, 1, 2])
+    assert not (store / "verified.jsonl").exists()
+    assert_is(steps_of(EpisodeStore(store), 2), 2)
+
+
+def test_a_link_in_place_of_the_list_is_not_followed(store, tmp_path):
+    (tmp_path / "elsewhere").write_text("")
+    (store / "verified.jsonl").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ForbesError, match="is a symbolic link"):
+        EpisodeStore(store).verify([0])
+    assert (tmp_path / "elsewhere").read_text() == ""
+
+
 def test_a_missing_file_is_damage_too(store):
     (store / "000002.npz").unlink()
     with EpisodeWriter(store) as writer:
@@ -284,10 +365,10 @@ def test_objects_are_never_unpickled(store):
     np.savez(store / "evil.npz", observation=np.array([{}], object), action=np.zeros(1), reward=np.zeros(1))
     content = (store / "evil.npz").read_bytes()
     record = EpisodeStore(store).records[0]._replace(size=len(content))
-    from forbes.data.episodes.episode import map_episode
-
+    with open(store / "evil.npz", "rb", buffering=0) as file:
+        verified = stamp_of(file)
     with pytest.raises(DamagedEpisodeError, match="has dtype object"):
-        map_episode(store / "evil.npz", record, verify=False)
+        map_episode(store / "evil.npz", record, verified)
 
 
 @pytest.mark.parametrize("line", ["nonsense", "[]", "3", '{"number": 1}', '{"set_aside": 1}', '{"a": 1, "b": 2}'])
