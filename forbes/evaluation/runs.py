@@ -43,7 +43,7 @@ class TrainedRun(NamedTuple):
         """
         name = model_name(self.model)
         for part in reversed(Path(self.path).resolve().parts):
-            if match := re.fullmatch(rf"{name}((?:_[a-z]+)+)(?:-\d+)?", part, re.IGNORECASE):
+            if match := re.search(rf"(?<![a-z]){name}((?:_[a-z]+)+)(?![a-z])", part, re.IGNORECASE):
                 return name + match[1].replace("_", " ")
         return name
 

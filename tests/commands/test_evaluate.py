@@ -462,7 +462,12 @@ def test_wrong_arguments_are_named(runs, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("path", "family"),
-    [("runs/compare/rssm_wide-0", "RSSM wide"), ("runs/rssm_wide/7-0", "RSSM wide"), ("r-1", "RSSM")],
+    [
+        ("runs/compare/rssm_wide-0", "RSSM wide"),
+        ("runs/rssm_wide/7-0", "RSSM wide"),
+        ("long-rssm_wide-0", "RSSM wide"),
+        ("r-1", "RSSM"),
+    ],
 )
 def test_the_folder_of_a_run_adds_to_its_family(runs, path, family):
     assert load_runs(runs[1:])[0]._replace(path=path).family == family
