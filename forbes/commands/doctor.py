@@ -6,7 +6,6 @@ import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 from typing import NamedTuple
 
 import torch
@@ -26,12 +25,11 @@ __all__ = ["main"]
 
 _DRIVER_LIMIT = 30.0
 """Timeout of nvidia-smi in seconds; it takes a few seconds to wake a GPU."""
-REQUIRED = ("torch", "lightning", "jsonargparse", "numpy", "matplotlib", "pandas")
+REQUIRED = ("torch", "lightning", "torchmetrics", "jsonargparse", "numpy", "matplotlib", "pandas")
+REQUIRED += ("dm-control", "mujoco")
 OPTIONAL = {
     "scikit-image": "build",
     "tensorboard": "tracking",
-    "dm-control": "dmc",
-    "mujoco": "dmc",
     "gymnasium": "gym",
 }
 
@@ -107,9 +105,7 @@ def _driver(program: str) -> str:
 
 
 def _rendering() -> Iterator[Finding]:
-    """Try every rendering backend, that of MUJOCO_GL first; skip this without dm-control."""
-    if find_spec("dm_control") is None:
-        return
+    """Try every rendering backend, that of MUJOCO_GL first."""
     asked = os.environ.get("MUJOCO_GL")
     if asked:
         yield Finding("MUJOCO_GL", asked)
