@@ -31,7 +31,7 @@ from forbes.runs.stop import StopOnSignal
 __all__ = ["RecordRun", "command_line", "commit", "origin", "read_provenance"]
 
 PACKAGES = ("torch", "lightning", "jsonargparse", "numpy", "dm-control", "mujoco", "gymnasium")
-"""Packages that may change the results of a run; the last three are optional."""
+"""Packages that may change the results of a run; gymnasium is optional."""
 
 
 class RecordRun(SaveConfigCallback):
