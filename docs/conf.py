@@ -30,7 +30,7 @@ extensions = [
 ]
 
 root_doc = "docs/index"
-include_patterns = ["docs/**", "notebooks/**", "configs/README.md", "benchmarks/*.md", "data/README.md", "*.md"]
+include_patterns = ["docs/**", "notebooks/**", "*.md", "*/README.md", "benchmarks/gpu.md"]
 exclude_patterns = ["README.md", "docs/site", "docs/results/runs", "build", "runs", "tests", ".*", "**/.*"]
 
 default_role = "py:obj"  # a docstring's `name` is code, and a link where it is documented
@@ -58,7 +58,8 @@ html_copy_source = False
 
 nitpicky = True
 nitpick_ignore_regex = [  # what has no page here
-    (r"py:.*", r"(abc|argparse|collections|functools|inspect|lightning|matplotlib|numpy|pathlib|torch|typing)\..*"),
+    (r"py:.*", r"(lightning|matplotlib|numpy|torch|torchmetrics)\..*"),
+    (r"py:.*", r"(abc|argparse|collections|functools|inspect|pathlib|typing)\..*"),
     (r"py:class", r"forbes\.\w+\..*"),
     (r"py:obj", r".*"),  # `(B, T)`
     (r"py:.*", r"(Any|Callable|Literal|Sequence|Mapping|Iterator|Path|Self|Tensor|ndarray|ABC|module|optional)"),

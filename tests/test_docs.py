@@ -5,6 +5,8 @@ import importlib
 import inspect
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import lightning
@@ -22,6 +24,7 @@ PAGES = [
     *(ROOT / "docs").rglob("*.md"),
     *(ROOT / "benchmarks").glob("*.md"),
     ROOT / "configs/README.md",
+    *(ROOT / "notebooks").glob("*.ipynb"),
 ]
 page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 
@@ -31,8 +34,16 @@ def anchor(heading):
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
+def text_of(page):
+    """The text of a page, or of the cells of a notebook that are not code."""
+    if page.suffix != ".ipynb":
+        return page.read_text()
+    cells = json.loads(page.read_text())["cells"]
+    return "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+
+
 def anchors(path):
-    return {anchor(heading) for heading in re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)}
+    return {anchor(heading) for heading in re.findall(r"^#+ (.*)$", text_of(path), re.MULTILINE)}
 
 
 def commands(text):
@@ -56,7 +67,7 @@ def flags(parser):
 
 @page
 def test_every_link_leads_to_a_page_and_heading(page):
-    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+    for target in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
         name, _, heading = target.partition("#")
         path = (page.parent / name).resolve() if name else page
         if "://" not in target:
@@ -66,7 +77,7 @@ def test_every_link_leads_to_a_page_and_heading(page):
 
 @page
 def test_every_command_and_flag_of_a_page_exists(page):
-    for name, *words in commands(page.read_text()):
+    for name, *words in commands(text_of(page)):
         used = {word.strip("[]").split("=")[0] for word in words if word.strip("[").startswith("-")}
         if name == "--help":
             continue
@@ -188,3 +199,18 @@ def test_every_recorded_number_is_explained(tiny_config, tmp_path, monkeypatch):
     assert not [name for name in sorted(found) if not any(pattern.match(name) for pattern in patterns.values())]
     unseen = {name for name, pattern in patterns.items() if not any(map(pattern.match, found))}
     assert {name for name in unseen if "/" in name or "[" in name} == RARE  # others are of `completions.json`
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    built = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-c", ROOT / "docs", ROOT, tmp_path],
+        capture_output=True,
+        text=True,
+    )
+
+    assert built.returncode == 0, built.stderr
+    assert (tmp_path / "index.html").exists()
+    page = (tmp_path / "docs/equations.html").read_text()
+    assert "<math" in page
+    assert not re.search(r"(src|href)=\"https?://[^\"]*\.(js|css)", page)  # it is read without a network, too

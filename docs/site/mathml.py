@@ -9,14 +9,19 @@ from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx.writers.html5 import HTML5Translator
 
+REWRITTEN = (
+    (r"\\(t?frac)\s*(\w)\s*(\w)", r"\\\1{\2}{\3}"),  # \tfrac12
+    (r"\\dots|…", r"\\ldots "),
+    (r"\\(big|Big)(?=[\[\]()|{}\\])", r"\\\1l"),  # \Big( without a side
+    (r"\\(log|det|exp|max|min|tanh)\s*(?=[^\W_]|\\(?!left|big)[a-z])", r"\\\1\\,"),  # the thin space of TeX
+)
+"""What docutils does not read, and what it reads."""
+
 
 def rewritten(formula: str, block: bool) -> str:
-    r"""Return a formula without what docutils does not read: `\tfrac12`, `\Big(`, and lines without an environment."""
-    formula = re.sub(r"\\(t?)frac\s*(\w)\s*(\w)", r"\\\1frac{\2}{\3}", formula)
-    formula = re.sub(r"\\tfrac(\{\w+\}\{\w+\})", r"{\\textstyle\\frac\1}", formula)
-    formula = formula.replace(r"\dots", r"\ldots").replace("…", r"\ldots ")
-    formula = re.sub(r"\\(big|Big)(?=[\[\]()|{}\\])", r"\\\1l", formula)
-    formula = re.sub(r"\\(log|det|exp|max|min|tanh)\s*(?=[^\W_]|\\(?!left|big)[a-z])", r"\\\1\\,", formula)  # TeX's thin space
+    """Return a formula that docutils reads; lines of a block without an environment are aligned."""
+    for pattern, replacement in REWRITTEN:
+        formula = re.sub(pattern, replacement, formula)
     if block and r"\\" in formula and r"\begin" not in formula:
         formula = rf"\begin{{aligned}}{formula}\end{{aligned}}"
     return formula
