@@ -25,8 +25,17 @@ __all__ = ["main"]
 
 _DRIVER_LIMIT = 30.0
 """Timeout of nvidia-smi in seconds; it takes a few seconds to wake a GPU."""
-REQUIRED = ("torch", "lightning", "torchmetrics", "jsonargparse", "numpy", "matplotlib", "pandas")
-REQUIRED += ("dm-control", "mujoco")
+REQUIRED = (
+    "torch",
+    "lightning",
+    "torchmetrics",
+    "jsonargparse",
+    "numpy",
+    "matplotlib",
+    "pandas",
+    "dm-control",
+    "mujoco",
+)
 OPTIONAL = {
     "scikit-image": "build",
     "tensorboard": "tracking",

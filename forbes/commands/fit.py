@@ -17,13 +17,15 @@ from jsonargparse import DefaultHelpFormatter
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import CheckpointIO
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.callbacks import Callback, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 import forbes.callbacks  # registers their short names for configurations
 from forbes.callbacks.divergence import StopAtDivergence
+from forbes.callbacks.picture import FileCallback
 from forbes.commands.lower_rate import MOST, LowerRateError, at_half_the_rate
 from forbes.commands.parsers.fit import DESCRIPTION, run_options
 from forbes.commands.trainer_arguments import require_usable
@@ -41,7 +43,7 @@ from forbes.runs.configuration import (
     require_classes,
 )
 from forbes.runs.folder import RunFolder, experiment_name, read_config
-from forbes.runs.loggers import ParserOfRuns, open_logger
+from forbes.runs.loggers import ParserOfRuns, open_logger, shows
 from forbes.runs.metrics_log import JsonLinesLogger, MarkStart
 from forbes.runs.modules import check_weights, weights_of
 from forbes.runs.progress import progress
@@ -248,7 +250,9 @@ class _Experiment(LightningCLI):
         loggers = config["logger"]
         if loggers is not False:
             named = _as_list(None if loggers is True else loggers)
-            loggers = [JsonLinesLogger(run.metrics), *(open_logger(logger, run.path) for logger in named)]
+            opened = [open_logger(logger, run.path) for logger in named]
+            _tell_hidden_pictures(opened, callbacks, run)
+            loggers = [JsonLinesLogger(run.metrics), *opened]
         return {"logger": loggers, "default_root_dir": config["default_root_dir"] or run.path}
 
     def _open_run(self) -> RunFolder:
@@ -303,6 +307,14 @@ class _Experiment(LightningCLI):
         trainer = self.config["trainer"]
         names = [name for name in _LIMITS if trainer[name] not in (None, -1)]
         return ", ".join(f"{name} {trainer[name]}" for name in names)
+
+
+def _tell_hidden_pictures(loggers: Sequence[Logger], callbacks: Sequence[Callback], run: RunFolder) -> None:
+    """Print which pictures of the callbacks a logger does not show."""
+    names = [callback.filename for callback in callbacks if isinstance(callback, FileCallback)]
+    for logger in loggers:
+        if hidden := [name for name in names if not shows(logger, name)]:
+            print(f"{type(logger).__name__} does not show {', '.join(hidden)}; see {run.figures}", flush=True)
 
 
 def _print_metrics(found: Sequence[Mapping[str, float]]) -> None:
