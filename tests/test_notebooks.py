@@ -10,7 +10,6 @@ from pathlib import Path
 import nbformat
 import pytest
 from nbclient import NotebookClient
-from traitlets.config import Config
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -34,9 +33,7 @@ def test_a_notebook_runs(path, tmp_path, monkeypatch):
     (sizes,) = [cell for cell in content.cells if "parameters" in cell.metadata.get("tags", ())]
     (sizes.source,) = sizes.metadata.tiny
 
-    local = Config({"KernelManager": {"transport": "ipc"}})  # files in place of ports
-    resources = {"metadata": {"path": str(tmp_path)}}
-    NotebookClient(content, timeout=300, config=local, resources=resources).execute()
+    NotebookClient(content, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
 
 
 @notebook
