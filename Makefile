@@ -1,12 +1,12 @@
 # Everything works on a machine that has only Python >= 3.11, git and make: the first target called makes .venv.
 #   make fit [CONFIG=strokes/forbes]   train, and draw the pictures
 #   make compare                       FORBES against RSSM: two trainings, their scores, the paper's figures
-#   make test | lint | faults | bench
+#   make test | lint | docs | faults | bench
 PYTHON ?= python3
 CONFIG ?= strokes/forbes
 BIN := .venv/bin
 
-.PHONY: fit compare test lint faults bench clean
+.PHONY: fit compare test lint docs faults bench clean
 .DELETE_ON_ERROR:
 
 fit: .venv/installed
@@ -26,6 +26,10 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The site, build/docs/index.html; needs no network. A warning, such as a link that leads nowhere, is an error.
+docs: .venv/installed-dev
+	$(BIN)/sphinx-build -q -W --keep-going -c docs . build/docs
+
 # Twenty minutes on 2 cores; writes what came of it.
 faults: .venv/installed-dev
 	PYTHONPATH=tests $(BIN)/python -m faults --report docs/reliability.md
@@ -34,7 +38,7 @@ bench: .venv/installed-dev
 	set -e; for benchmark in benchmarks/*.py; do $(BIN)/python $$benchmark; done
 
 clean:
-	rm -rf .venv dist .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv build dist docs/generated .mypy_cache .ruff_cache .pytest_cache
 
 # torch first, so that nothing else chooses its version. On Linux this is the CUDA build (2 GB); without a GPU,
 #   PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu make fit
