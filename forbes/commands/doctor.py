@@ -7,7 +7,6 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -21,6 +20,7 @@ from forbes.data.strokes.classifiers import classifiers_path
 from forbes.data.strokes.dejong import dejong_path
 from forbes.data.strokes.source import bundled_path
 from forbes.envs.rendering import BACKENDS, probe_backend
+from forbes.runs.configs import config_folder
 
 __all__ = ["main"]
 
@@ -120,9 +120,7 @@ def _rendering() -> Iterator[Finding]:
 
 
 def _data() -> Iterator[Finding]:
-    package = Path(forbes.__file__).parent
-    shipped = package / "configs" if (package / "configs").is_dir() else package.parent / "configs"
-    yield Finding("configurations", str(shipped))
+    yield Finding("configurations", str(config_folder()))
     for name, path, remedy, needed in (
         ("strokes, bundled", bundled_path(), "forbes data build-strokes --images DIR", True),
         ("digit classifiers", classifiers_path(), "reinstall forbes, if you need forbes completions", False),

@@ -31,6 +31,7 @@ from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.runs.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
 from forbes.runs.config_errors import building, one_sentence, raised_inside, said_by_lightning
+from forbes.runs.configs import with_config_paths
 from forbes.runs.configuration import (
     add_links,
     add_seed,
@@ -101,13 +102,14 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     for name in ("profilers.profiler", "callbacks.model_summary"):  # the user has requested their output
         logging.getLogger(f"lightning.pytorch.{name}").setLevel(logging.INFO)
     allow_modules()
+    with_paths = with_config_paths(arguments)
     with ExitStack() as stack, warnings.catch_warnings():
         for message in _NOT_OURS:
             warnings.filterwarnings("ignore", message)
         try:
-            return _Experiment(command, arguments, stack).execute()
+            return _Experiment(command, arguments, with_paths, stack).execute()
         except argparse.ArgumentError as error:
-            raise ForbesError(one_sentence(str(error), arguments)) from error
+            raise ForbesError(one_sentence(str(error), with_paths)) from error
         except (MisconfigurationException, ImportError, RuntimeError, TypeError, ValueError) as error:
             if inner := raised_inside(error):
                 raise inner from None
@@ -152,16 +154,17 @@ class _Experiment(LightningCLI):
 
     Args:
         command: fit, validate, test or predict.
-        arguments: options of the command.
+        arguments: options of the command, as they are recorded.
+        with_paths: the same, with `--config PATH` for each configuration.
         stack: exit stack that holds the lock of the run folder; closed when the command ends.
     """
 
-    def __init__(self, command: str, arguments: Sequence[str], stack: ExitStack) -> None:
-        self.command, self.arguments, self.stack = command, arguments, stack
+    def __init__(self, command: str, arguments: Sequence[str], with_paths: Sequence[str], stack: ExitStack) -> None:
+        self.command, self.arguments, self.with_paths, self.stack = command, arguments, with_paths, stack
         self.stop: StopOnSignal | None = None
-        self.options, configuration = _FitOptions(), list(arguments)
+        self.options, configuration = _FitOptions(), list(with_paths)
         if command == "fit":
-            self.options, configuration = _FitOptions.parse(arguments)
+            self.options, configuration = _FitOptions.parse(with_paths)
         super().__init__(
             model_class=LightningModule,
             datamodule_class=SequenceDataModule,
@@ -169,7 +172,7 @@ class _Experiment(LightningCLI):
             trainer_defaults={"devices": 1, "enable_model_summary": False},
             parser_kwargs={
                 "prog": f"forbes {self.command}",
-                "usage": f"forbes {self.command} --config FILE [--OPTION VALUE ...]",
+                "usage": f"forbes {self.command} CONFIG [CONFIG ...] [--OPTION VALUE ...]",
                 "formatter_class": _Help,
                 "description": DESCRIPTION[self.command],
                 "epilog": run_options().format_help() if self.command == "fit" else None,
@@ -214,7 +217,7 @@ class _Experiment(LightningCLI):
 
     def _where(self) -> str:
         """Return the configuration files, for error messages."""
-        files = [value for flag, value in itertools.pairwise(self.arguments) if flag in ("--config", "-c", "--resume")]
+        files = [value for flag, value in itertools.pairwise(self.with_paths) if flag in ("--config", "--resume")]
         return " and ".join(files) or "the configuration"
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:

@@ -26,7 +26,7 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
             do not fit together.
 
     Example:
-        >>> world, data = forbes.load_run("runs/forbes-0")  # forbes fit --run_dir runs/forbes-0 --config ...
+        >>> world, data = forbes.load_run("runs/forbes-0")  # forbes fit strokes/forbes --run_dir runs/forbes-0
         >>> world.terms(data.sequences("test", torch.arange(8))).elbo.shape
         torch.Size([8])
     """
