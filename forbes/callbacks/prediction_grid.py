@@ -3,12 +3,11 @@
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.callbacks.picture import PictureCallback, require_context, require_frames
+from forbes.callbacks.picture import PictureCallback, colour_of, require_context, require_frames
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
-from forbes.figures.style import BLUE
 from forbes.training.world_model import WorldModel
 
 __all__ = ["PredictionGrid"]
@@ -46,8 +45,9 @@ class PredictionGrid(PictureCallback):
         batch = whole_sequences(data, "validation", index).to(module.device)
         times = sorted({data.length, batch.observation.shape[1]})
         completions = complete(module.model, data.source, batch, self.context, self.samples)
+        colour = colour_of(module.model)
         sampled = [
-            Panel(f"sampled completions, t = {time}", completions.at(time).transpose(0, 1), BLUE) for time in times
+            Panel(f"sampled completions, t = {time}", completions.at(time).transpose(0, 1), colour) for time in times
         ]
         pictures = data.source.pictures(batch.observation)
         return draw_panels([truth_panel(pictures, times[::-1]), seen_panel(pictures, self.context), *sampled])

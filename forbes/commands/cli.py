@@ -48,7 +48,9 @@ COMMANDS = {
         "RUN RUN -o figures",
         "forbes.commands.completions:main",
     ),
-    "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.commands.figures:main"),
+    "figures": Command(
+        "draw the paper's figures", "predictions --runs RUN RUN -o figures", "forbes.commands.figures:main"
+    ),
     "data": Command(
         "fetch, build, collect and show data", "show strokes -o strokes.png", "forbes.commands.parsers.data:main"
     ),

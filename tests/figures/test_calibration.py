@@ -5,7 +5,7 @@ import torch
 
 from forbes.errors import ForbesError
 from forbes.figures.calibration import RankedBelief, calibration
-from forbes.figures.style import BLUE, ORANGE, save_figure
+from forbes.figures.style import BLUE, ORANGE, Method, save_figure
 
 SAMPLES, COUNT = 39, 500
 
@@ -16,7 +16,7 @@ def belief(name, colour, width, seed=0, count=COUNT):
     truth, samples = (torch.randn(*shape, count, 2, generator=generator) for shape in ((), (SAMPLES,)))
     samples = width * samples
     density = (samples.square().sum(-1) < truth.square().sum(-1)).sum(0)  # (N,), how many are less dense is L - this
-    return RankedBelief(name, colour, (samples < truth).sum(0), SAMPLES - density)
+    return RankedBelief(name, Method(colour), (samples < truth).sum(0), SAMPLES - density)
 
 
 @pytest.fixture(scope="module")
