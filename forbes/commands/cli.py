@@ -42,6 +42,9 @@ COMMANDS = {
         "strokes/rssm strokes/forbes --seeds 3",
         "forbes.commands.compare:main",
     ),
+    "reproduce": Command(
+        "reproduce the paper, and report what held", "--budget small", "forbes.commands.reproduce:main"
+    ),
     "calibrate": Command("check a filter against its own model", "RUN -o figures", "forbes.commands.calibrate:main"),
     "completions": Command(
         "score sampled digit completions",

@@ -1,21 +1,18 @@
 """`forbes compare`: train several configurations with several seeds, evaluate them, and compare the results."""
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterable, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import yaml
 from rich.markdown import Markdown
 
 from forbes.commands.console import console
 from forbes.commands.evaluate import evaluate, wanted_metrics
-from forbes.commands.jobs import Job, run_jobs
+from forbes.commands.jobs import run_jobs
 from forbes.commands.parsers.compare import parser
+from forbes.commands.trainings import Training, training_job
 from forbes.errors import ForbesError
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record
@@ -25,13 +22,10 @@ from forbes.figures.style import save_png_and_pdf
 from forbes.files import replace_file
 from forbes.runs.checkpoint import open_checkpoint
 from forbes.runs.configs import find_config
-from forbes.runs.configuration import allowed_modules
-from forbes.runs.folder import RunFolder, read_config
+from forbes.runs.folder import RunFolder
 from forbes.runs.provenance import command_line, commit
 
 __all__ = ["main"]
-
-_SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed")  # the first is linked to the others
 
 
 def main(argv: Sequence[str]) -> None:
@@ -40,15 +34,12 @@ def main(argv: Sequence[str]) -> None:
     args, flags = parser().parse_args(argv[:cut]), list(argv[cut + 1 :])
     command = command_line("compare", *argv)
     folders = _run_folders(args.configs, args.seeds, args.output)
-    _train(
-        [
-            (config, seed, run)
-            for config, of_config in zip(args.configs, folders.values(), strict=True)
-            for seed, run in of_config.items()
-        ],
-        flags,
-        args.jobs,
-    )
+    trainings = [
+        Training(config, tuple(flags), seed, run)
+        for config, of_config in zip(args.configs, folders.values(), strict=True)
+        for seed, run in of_config.items()
+    ]
+    _train(trainings, args.jobs)
     loaded = load_runs([of_config[0] for of_config in folders.values()])
     wanted = wanted_metrics(loaded, args)
     families = [
@@ -77,59 +68,12 @@ def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, 
     return {name: {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)} for name in names}
 
 
-def _train(runs: Sequence[tuple[str, int, str]], flags: Sequence[str], at_once: int) -> None:
-    """Train all runs, given as (configuration, seed, folder), to the end. Finished runs return at once."""
-    jobs = []
-    for config, seed, run in runs:
-        if RunFolder(run).checkpoint.exists():
-            _require_same_configuration(run, config, seed, flags)
-            arguments = ["--resume", run]
-        else:
-            arguments = ["--config", config, *flags, "--seed_everything", str(seed), "--run_dir", run]
-        jobs.append(Job(run, _fit_command(arguments)))
-    failed = {run: status for run, status in run_jobs(jobs, at_once).items() if status != 0}
-    if failed:
+def _train(trainings: Sequence[Training], at_once: int) -> None:
+    """Run all trainings to the end. Finished runs return at once."""
+    statuses = run_jobs([training_job(training) for training in trainings], at_once)
+    if failed := {run: status for run, status in statuses.items() if status != 0}:
         ends = ", ".join(f"{run} with status {status}" for run, status in failed.items())
         raise ForbesError(f"trainings that failed: {ends}. Fix the errors above, then repeat the command")
-
-
-def _require_same_configuration(run: str, config: str, seed: int, flags: Sequence[str]) -> None:
-    """Refuse a run that was trained with another configuration, e.g. with fewer updates.
-
-    Callbacks may differ, since they only observe. Keys that the run's version of this package did not have are ignored.
-    """
-    trained = _flat(read_config(RunFolder(run).config))
-    trained |= {key: str(Path(trained[key]).absolute()) for key in trained if key.endswith(".path") and trained[key]}
-    asked = _flat(yaml.safe_load(_configuration(config, *flags))) | {key: seed for key in _SEEDS}
-    asked |= {key: str(Path(asked[key]).absolute()) for key in asked if key.endswith(".path") and asked[key]}
-    for key in asked:
-        if key in trained and trained[key] != asked[key] and key != "trainer.callbacks":
-            raise ForbesError(
-                f"{run}: was trained with {key} = {trained[key]}, expected {asked[key]}. Use its configuration and "
-                "flags, or another folder, -o"
-            )
-
-
-def _flat(section: Any, name: str = "") -> dict[str, Any]:
-    """Flatten a nested section: every value by its dotted key, e.g. `model.init_args.state_dim`."""
-    if not isinstance(section, dict):
-        return {name: section}
-    return {k: v for key, value in section.items() for k, v in _flat(value, f"{name}.{key}".strip(".")).items()}
-
-
-@cache
-def _configuration(config: str, *flags: str) -> str:
-    """Return the complete configuration that `forbes fit` would train with, as YAML."""
-    command = _fit_command(["--config", config, *flags, "--print_config"])
-    asked = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    if asked.returncode != 0:
-        raise ForbesError(f"{config}: `forbes fit` cannot train with it, see the error above. Fix it")
-    return asked.stdout
-
-
-def _fit_command(arguments: Sequence[str]) -> list[str]:
-    """Return the command of a `forbes fit` in its own process, so that trainings do not affect each other."""
-    return [sys.executable, "-m", "forbes", *allowed_modules(), "fit", *arguments]
 
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from forbes.commands import compare as compare_command
+from forbes.commands import trainings
 from forbes.commands.cli import main
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.metrics import score_of
@@ -37,7 +38,7 @@ def one_process():
     """A process of its own would spend most of a test on its imports."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare_command, "run_jobs", in_this_process)
-        patch.setattr(compare_command, "_configuration", configuration_in_this_process)
+        patch.setattr(trainings, "_configuration", configuration_in_this_process)
         yield
 
 

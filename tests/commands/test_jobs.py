@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from forbes.commands.jobs import Job, run_jobs
+from forbes.commands.jobs import Job, _Board, run_jobs
 
 
 def python(name, code):
@@ -89,3 +89,26 @@ run_jobs([Job(name, [sys.executable, "-c", sys.argv[1], sys.argv[2] + name]) for
     assert process.returncode != 0
     assert [(tmp_path / f"job-{name}").read_text() for name in "ab"] == ["1", "1"]
     assert not (tmp_path / "job-c").exists()
+
+
+def test_the_time_left_is_the_work_left_at_the_pace_so_far(monkeypatch, capsys):
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    board = _Board([Job("a", [], 1.0), Job("b", [], 1.0), Job("c", [], 2.0)], later=1.0)
+    board.shown()
+    board.say("b", "epoch 5/10  update 50/100")
+    clock[0] = 10.0
+
+    board.end("a", 0)
+
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "1 of 3 jobs have ended, about 0:00:23 left"  # 10 s for 1.5 hours, and 3.5 are left
+
+
+def test_a_job_tells_how_it_ended_and_what_it_said_last():
+    ended = []
+
+    run_jobs([python("bad", "print('first'); print('why'); raise SystemExit(3)")], 1, on_end=ended.append)
+
+    assert [(one.job.name, one.status, one.last) for one in ended] == [("bad", 3, "why")]
+    assert ended[0].hours > 0

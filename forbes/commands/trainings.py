@@ -1,0 +1,98 @@
+"""A list of trainings, and how it is worked off: each in its own process, resumed where it was interrupted."""
+
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from forbes.commands.jobs import Job
+from forbes.errors import ForbesError
+from forbes.runs.configuration import allowed_modules
+from forbes.runs.folder import RunFolder, read_config
+from forbes.runs.provenance import read_provenance
+
+__all__ = ["Training", "forbes_command", "is_finished", "training_job"]
+
+_SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed")  # the first is linked to the others
+
+
+class Training(NamedTuple):
+    """One training."""
+
+    config: str
+    """Configuration, as `forbes fit --config` accepts it."""
+    flags: tuple[str, ...]
+    """Flags that override keys of the configuration."""
+    seed: int
+    folder: str
+    """Run folder."""
+
+
+def training_job(training: Training, hours: float = 1.0) -> Job:
+    """Return the `forbes fit` that starts a training, or resumes it from its checkpoint.
+
+    Args:
+        training: training to run to its end.
+        hours: how long it takes, relative to the other jobs.
+
+    Raises:
+        ForbesError: if the folder has a run of another configuration.
+    """
+    if RunFolder(training.folder).checkpoint.exists():
+        _require_same_configuration(training)
+        return Job(training.folder, forbes_command("fit", "--resume", training.folder), hours)
+    config, flags, seed, folder = training
+    arguments = ["--config", config, *flags, "--seed_everything", str(seed), "--run_dir", folder]
+    return Job(folder, forbes_command("fit", *arguments), hours)
+
+
+def is_finished(folder: str) -> bool:
+    """Return whether the last training in a run folder came to its end."""
+    run = RunFolder(folder)
+    if not (run.checkpoint.is_file() and run.provenance.is_file()):
+        return False
+    entries = read_provenance(run.provenance)
+    return bool(entries) and entries[-1].get("exit_status") == 0
+
+
+def forbes_command(*arguments: str) -> list[str]:
+    """Return the command of a `forbes ...` in its own process, so that one does not affect another."""
+    return [sys.executable, "-m", "forbes", *allowed_modules(), *arguments]
+
+
+def _require_same_configuration(training: Training) -> None:
+    """Refuse a run that was trained with another configuration, e.g. with fewer updates.
+
+    Callbacks may differ, since they only observe. Keys that the run's version of this package did not have are ignored.
+    """
+    config, flags, seed, run = training
+    trained = _flat(read_config(RunFolder(run).config))
+    trained |= {key: str(Path(trained[key]).absolute()) for key in trained if key.endswith(".path") and trained[key]}
+    asked = _flat(yaml.safe_load(_configuration(config, *flags))) | {key: seed for key in _SEEDS}
+    asked |= {key: str(Path(asked[key]).absolute()) for key in asked if key.endswith(".path") and asked[key]}
+    for key in asked:
+        if key in trained and trained[key] != asked[key] and key != "trainer.callbacks":
+            raise ForbesError(
+                f"{run}: was trained with {key} = {trained[key]}, expected {asked[key]}. Use its configuration and "
+                "flags, or another folder, -o"
+            )
+
+
+def _flat(section: Any, name: str = "") -> dict[str, Any]:
+    """Flatten a nested section: every value by its dotted key, e.g. `model.init_args.state_dim`."""
+    if not isinstance(section, dict):
+        return {name: section}
+    return {k: v for key, value in section.items() for k, v in _flat(value, f"{name}.{key}".strip(".")).items()}
+
+
+@cache
+def _configuration(config: str, *flags: str) -> str:
+    """Return the complete configuration that `forbes fit` would train with, as YAML."""
+    command = forbes_command("fit", "--config", config, *flags, "--print_config")
+    asked = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if asked.returncode != 0:
+        raise ForbesError(f"{config}: `forbes fit` cannot train with it, see the error above. Fix it")
+    return asked.stdout

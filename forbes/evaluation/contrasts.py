@@ -1,0 +1,157 @@
+"""Measure the contrast of a claim from the records of runs, seed by seed, and check Theorem 1 in closed form."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from forbes.errors import ForbesError
+from forbes.evaluation.claims import Claim
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.record import read_arrays, read_record
+from forbes.evaluation.theorem import (
+    ClosedFormProcess,
+    elbo,
+    exact_filter,
+    exact_one_step,
+    expected_kl,
+    factorised_optimum,
+    log_evidence,
+    smoothing,
+    structured_optimum,
+)
+from forbes.reading import is_number, read_json
+
+__all__ = ["TheoremGaps", "contrast", "entry_of", "score_name", "task_of"]
+__all__ += ["theorem_gaps"]
+
+Runs = Mapping[tuple[str, int], str]
+"""Folders of finished runs by family and seed."""
+
+
+def score_name(metric: str) -> str:
+    """Return the score in a metric's full name, e.g. `pll` for `test[:1000]/pll[bernoulli,K=128]`."""
+    match = re.search(r"(\w+)\[[^\[\]]*\]$", metric)
+    return match[1] if match else metric
+
+
+def entry_of(run: str, score: str) -> tuple[str, dict[str, Any]] | None:
+    """Return the newest entry of a score in a run's record, with its full name; None if there is none."""
+    entries = [(name, entry) for name, entry in read_record(run).items() if score_name(name) == score]
+    return max(entries, key=lambda found: str(found[1].get("date", "")), default=None)
+
+
+def contrast(claim: Claim, runs: Runs, completions: Mapping[int, Path]) -> dict[int, Estimate]:
+    """Return the difference that tests a claim for each seed, positive if it agrees with the claim.
+
+    Args:
+        claim: claim with its families.
+        runs: finished runs. Seeds that lack one of the families are left out.
+        completions: `completions.json` of each seed.
+
+    Raises:
+        ForbesError: if runs that are compared were measured on different sequences.
+    """
+    found = {}
+    for seed in sorted({seed for _, seed in runs}):
+        if not all((family, seed) in runs for family in claim.families):
+            continue
+        if claim.score in ("clear", "js"):
+            difference = _completed(claim, completions.get(seed))
+        else:
+            difference = _paired(claim, {family: runs[family, seed] for family in claim.families})
+        if difference is not None:
+            found[seed] = difference
+    return found
+
+
+def _paired(claim: Claim, runs: Mapping[str, str]) -> Estimate | None:
+    """Return the mean difference over the sequences of all families; None if one was not measured.
+
+    Families of one task have the same sequences, and are paired. Tasks are independent, and are summed.
+    """
+    _require_same_data(claim, runs)
+    scores = {family: _scores(run, claim.score) for family, run in runs.items()}
+    tasks: dict[str, NDArray[np.float64]] = {}
+    for family in claim.families:
+        values = scores[family]
+        if values is None:
+            return None
+        task, sign = task_of(family), 1 if family in claim.plus else -1
+        tasks[task] = tasks.get(task, 0.0) + claim.sign * sign * values
+    if (order := _order(claim, runs)) is None:
+        return None
+    estimates = [Estimate.of(torch.from_numpy(values)) for values in tasks.values()]
+    mean, error = sum(one.mean for one in estimates), math.hypot(*(one.standard_error for one in estimates))
+    return Estimate(order * mean, error)
+
+
+def _order(claim: Claim, runs: Mapping[str, str]) -> float | None:
+    """Return -1 if the first family has the lower score `ordered_by`, else 1; None if one was not measured."""
+    if not claim.ordered_by:
+        return 1.0
+    first, second = (_scores(runs[side[0]], claim.ordered_by) for side in (claim.plus, claim.minus))
+    return None if first is None or second is None else math.copysign(1.0, first.mean() - second.mean())
+
+
+def task_of(family: str) -> str:
+    """Return the task of a family: its name up to the slash."""
+    return family.partition("/")[0]
+
+
+def _scores(run: str, score: str) -> NDArray[np.float64] | None:
+    """Return the score of each sequence or episode, `(N,)`."""
+    found = entry_of(run, score)
+    return None if found is None else read_arrays(run).get(found[0])
+
+
+def _require_same_data(claim: Claim, runs: Mapping[str, str]) -> None:
+    """Refuse runs of one task that were measured on different data. Agents are measured in their environment."""
+    seen: dict[str, tuple[str, Any]] = {}
+    for family, run in runs.items():
+        name, entry = entry_of(run, claim.score) or ("", {})
+        about = name, entry.get("data"), entry.get("seed")
+        other, expected = seen.setdefault(task_of(family), (run, about))
+        if about != expected:
+            raise ForbesError(
+                f"{run}: its {claim.score} was measured otherwise than that of {other}. Evaluate both again"
+            )
+
+
+def _completed(claim: Claim, path: Path | None) -> Estimate | None:
+    """Return the difference that `forbes completions` has recorded, of the first run minus the second."""
+    if path is None or not path.is_file():
+        return None
+    for entry in read_json(path, "Delete it, and repeat the command")["scores"]:
+        if entry["minus"] is not None and score_name(entry["metric"]) == claim.score:
+            mean, error = entry["mean"], entry["standard_error"]
+            return Estimate(claim.sign * mean, error) if is_number(mean) and is_number(error) else None
+    return None
+
+
+class TheoremGaps(NamedTuple):
+    """Both forms of Theorem 1 in closed form, over processes and posteriors."""
+
+    filtering: Sequence[float]
+    """|Σ KL to the filtering beliefs − (log p − ELBO)|, nats per sequence: the paper's form."""
+    smoothing: Sequence[float]
+    """The same with the smoothing conditionals."""
+
+
+def theorem_gaps(steps: int = 15) -> TheoremGaps:
+    """Return the errors of both forms of Theorem 1 for three linear-Gaussian processes and four posteriors of each."""
+    filtering, smoothed = [], []
+    for case in ((1.0, 1.0, 1.0), (1.0, 0.1, 1.0), (0.9, 0.3, 0.5)):
+        process = ClosedFormProcess(*case, steps)
+        moment = process.moment()
+        for posterior_of in (exact_filter, exact_one_step, factorised_optimum, structured_optimum):
+            posterior = posterior_of(process)
+            gap = (log_evidence(process, moment) - elbo(process, posterior, moment)).item()
+            filtering.append(abs(expected_kl(posterior, exact_filter(process), moment).item() - gap))
+            smoothed.append(abs(expected_kl(posterior, smoothing(process), moment).item() - gap))
+    return TheoremGaps(filtering, smoothed)
