@@ -45,6 +45,7 @@ COMMANDS = {
         "RUN RUN -o figures",
         "forbes.commands.completions:main",
     ),
+    "complete": Command("draw completions of digits", "RUN -o picture.png", "forbes.commands.complete:main"),
     "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.commands.figures:main"),
     "data": Command(
         "fetch, build, collect and show data", "show strokes -o strokes.png", "forbes.commands.parsers.data:main"
