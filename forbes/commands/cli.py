@@ -46,6 +46,7 @@ COMMANDS = {
         "forbes.commands.completions:main",
     ),
     "complete": Command("draw completions of digits", "RUN -o picture.png", "forbes.commands.complete:main"),
+    "export": Command("export a model to share", "RUN -o shared/model", "forbes.commands.export:main"),
     "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.commands.figures:main"),
     "data": Command(
         "fetch, build, collect and show data", "show strokes -o strokes.png", "forbes.commands.parsers.data:main"
@@ -58,7 +59,7 @@ usage: forbes COMMAND ...
 
 Learn, evaluate and use belief states of partially observable processes.
 
-commands, each with an example (RUN is a run folder written by `forbes fit`):
+commands, each with an example (RUN is a run folder written by `forbes fit`, or a pretrained:NAME):
 {commands}
 options:
   --help               show this page, or that of a command

@@ -30,6 +30,7 @@ from forbes.evaluation.runs import (
     split_batches,
 )
 from forbes.evaluation.scoring import PartialScores, Scorer, exact_scorer, make_scorer, score_split, with_progress
+from forbes.runs.folder import RunFolder
 from forbes.runs.provenance import command_line, commit, origin
 
 __all__ = ["WantedMetrics", "evaluate", "main", "wanted_metrics"]
@@ -56,13 +57,17 @@ def main(argv: Sequence[str]) -> None:
     if is_agent(args.runs[0]):
         device = find_device(args.device)
         played = evaluate_agents(folders, args.episodes, args.acting_samples, args.seed, device, command)
-        return print_agents(played)
-    measured = evaluate(args.runs, args, command, folders)
-    print_runs(measured)
-    print_references(measured)
-    if len(measured) > 1:
-        print_pairs(compare_pairs(measured))
-    print_degradation(measured)
+        print_agents(played)
+    else:
+        measured = evaluate(args.runs, args, command, folders)
+        print_runs(measured)
+        print_references(measured)
+        if len(measured) > 1:
+            print_pairs(compare_pairs(measured))
+        print_degradation(measured)
+    for run, folder in folders.items():
+        if folder != RunFolder(run).results:
+            print(f"the results of {run} are in {folder}")
 
 
 def evaluate(
