@@ -7,8 +7,9 @@ from typing import Any
 
 from lightning import LightningModule
 
-from forbes.bundled import PRETRAINED, bundled
+from forbes.bundled import PRETRAINED, bundled, is_pretrained
 from forbes.commands.parsers.export import parser
+from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.record import read_record
 from forbes.evaluation.runs import data_name
@@ -28,7 +29,10 @@ def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
     run = RunFolder.trained(args.run)
-    output = RunFolder(args.output or Path("exported") / run.path.resolve().name)
+    folder = args.output or Path("exported") / run.path.resolve().name
+    if is_pretrained(folder) or folder.suffix == ".ckpt":
+        raise ForbesError(f"-o {folder}: is not the name of a folder that can be written. Choose another")
+    output = RunFolder(folder)
     source, exported = export_run(run, output)
     scores = _of(read_record(run.checkpoint), source) | _of(read_record(output.path), exported)
     replace_file(output.path / "evaluation.json", json.dumps(shareable(scores), indent=2).encode() + b"\n")

@@ -9,7 +9,7 @@ from lightning import LightningModule
 from torch import Tensor
 
 from forbes.errors import ForbesError
-from forbes.files import replace_file
+from forbes.files import replace_file, require_no_links
 from forbes.runs.checkpoint import compressed_checkpoint, open_checkpoint, read_checkpoint
 from forbes.runs.folder import RunFolder
 from forbes.runs.modules import build_run, check_weights, weights_of
@@ -36,8 +36,9 @@ def export_run(run: RunFolder, output: RunFolder) -> tuple[str, str]:
         SHA-256 of the run's checkpoint, and of the exported one.
 
     Raises:
-        ForbesError: if the run cannot be loaded, or the output holds another run.
+        ForbesError: if the run cannot be loaded or a file in it is a link, or if the output holds another run.
     """
+    require_no_links((run.config, run.provenance, run.metrics))  # they would bring other files into the export
     file = open_checkpoint(run.checkpoint)
     state = weights_of(file.content, str(run.checkpoint))
     module, _, _ = build_run(run)

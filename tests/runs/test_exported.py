@@ -114,8 +114,19 @@ def test_another_run_is_not_overwritten(run, exported, tiny_run, tmp_path, capsy
 
     assert "run: holds another run. Choose another folder" in error_of(capsys, "export", run, "-o", run)
     assert "export: holds another run" in error_of(capsys, "export", exported, "-o", exported)
+    for name in ("model.ckpt", "pretrained:strokes-forbes"):
+        assert f"-o {name}: is not the name of a folder" in error_of(capsys, "export", run, "-o", name)
     assert "notes: has other files" in error_of(capsys, "export", run, "-o", tmp_path / "notes")
     assert run.checkpoint.read_bytes() == before
+
+
+def test_a_link_brings_no_other_file_into_an_export(run, tmp_path, capsys):
+    (tmp_path / "secret").write_text("{}")
+    run.metrics.unlink()
+    run.metrics.symlink_to(tmp_path / "secret")
+
+    assert "metrics.jsonl: is a symbolic link" in error_of(capsys, "export", run, "-o", tmp_path / "export")
+    assert not (tmp_path / "export").exists()
 
 
 def test_a_run_that_cannot_be_loaded_is_not_exported(run, tmp_path, capsys):
