@@ -109,7 +109,7 @@ def _scores(entries: Entries, exported: str) -> str:
         (
             f"`{name}`",
             _estimate(entry),
-            _best(entry.get("references", {})),
+            _best(entry),
             "exported" if entry["checkpoint"] == exported else "before rounding",
         )
         for name, entry in measured.items()
@@ -122,12 +122,14 @@ def _estimate(entry: Mapping[str, Any]) -> str:
     return str(Estimate(entry["mean"], entry["standard_error"]))
 
 
-def _best(references: Mapping[str, Any]) -> str:
-    """Return the reference with the highest score."""
+def _best(entry: Mapping[str, Any]) -> str:
+    """Return the reference with the highest score, and whether it is above the model's."""
+    references = entry.get("references", {})
     if not references:
         return ""
     name = max(references, key=lambda one: references[one]["mean"])
-    return f"{name}: {_estimate(references[name])}"
+    above = " (higher)" if references[name]["mean"] > entry["mean"] else ""
+    return f"{name}: {_estimate(references[name])}{above}"
 
 
 def _table(header: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> str:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from command_line import error_of
 
+from forbes.commands import export
 from forbes.commands.cli import main
 from forbes.evaluation.record import read_record
 from forbes.runs.checkpoint import compressed_checkpoint, open_checkpoint, read_checkpoint
@@ -82,6 +83,21 @@ def test_scores_of_the_run_are_marked_until_the_export_is_evaluated(run, tmp_pat
     assert "| exported |" in after
     mean = read_record(tmp_path / "export")["test[:4]/elbo[bernoulli,S=16]"]["mean"]
     assert f"{mean:.2f} ±" in after
+
+
+def test_a_card_says_where_a_reference_is_higher():
+    entry = {"mean": -34.0, "standard_error": 0.5, "checkpoint": "a"}
+    better, worse = {"mean": -33.0, "standard_error": 0.5}, {"mean": -35.0, "standard_error": 0.5}
+    entries = {"one": entry | {"references": {"5-gram": better, "1-gram": worse}}, "two": {**entry, "checkpoint": "b"}}
+    entries["three"] = entry | {"references": {"1-gram": worse}}
+
+    rows = export._scores(entries, "a").splitlines()[-3:]
+
+    assert rows == [
+        "| `one` | -34.00 ± 0.50 | 5-gram: -33.00 ± 0.50 (higher) | exported |",
+        "| `two` | -34.00 ± 0.50 |  | before rounding |",
+        "| `three` | -34.00 ± 0.50 | 1-gram: -35.00 ± 0.50 | exported |",
+    ]
 
 
 def test_an_export_names_no_machine_and_no_folder(run, exported):
