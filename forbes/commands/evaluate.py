@@ -54,20 +54,19 @@ def main(argv: Sequence[str]) -> None:
     if args.checkpoint is not None:
         args.runs = [str(Path(run) / "checkpoints" / args.checkpoint) for run in args.runs]
     folders = results_folders(args.runs, args.output)
+    for run, folder in folders.items():
+        if folder != RunFolder(run).results:
+            print(f"the results of {run} go to {folder}", flush=True)
     if is_agent(args.runs[0]):
         device = find_device(args.device)
         played = evaluate_agents(folders, args.episodes, args.acting_samples, args.seed, device, command)
-        print_agents(played)
-    else:
-        measured = evaluate(args.runs, args, command, folders)
-        print_runs(measured)
-        print_references(measured)
-        if len(measured) > 1:
-            print_pairs(compare_pairs(measured))
-        print_degradation(measured)
-    for run, folder in folders.items():
-        if folder != RunFolder(run).results:
-            print(f"the results of {run} are in {folder}")
+        return print_agents(played)
+    measured = evaluate(args.runs, args, command, folders)
+    print_runs(measured)
+    print_references(measured)
+    if len(measured) > 1:
+        print_pairs(compare_pairs(measured))
+    print_degradation(measured)
 
 
 def evaluate(

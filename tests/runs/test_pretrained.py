@@ -68,7 +68,7 @@ def test_evaluating_a_pretrained_model_writes_to_the_current_folder(package, in_
 
     assert main(["evaluate", "pretrained:tiny", "pretrained:other", *FEW]) == 0
 
-    assert "the results of pretrained:tiny are in pretrained-tiny\n" in capsys.readouterr().out
+    assert "the results of pretrained:tiny go to pretrained-tiny\n" in capsys.readouterr().out
     (metric,) = (name for name in read_record("pretrained-other") if "/elbo" in name)
     assert "paired" in read_record("pretrained-tiny")[metric]
     assert contents(package) == before
