@@ -1,20 +1,20 @@
 # Everything works on a machine that has only Python >= 3.11, git and make: the first target called makes .venv.
-#   make fit [CONFIG=configs/strokes/forbes.yaml]   train, and draw the pictures
-#   make compare                                    FORBES against RSSM: two trainings, their scores, the paper's figures
+#   make fit [CONFIG=strokes/forbes]   train, and draw the pictures
+#   make compare                       FORBES against RSSM: two trainings, their scores, the paper's figures
 #   make test | lint | faults | bench
 PYTHON ?= python3
-CONFIG ?= configs/strokes/forbes.yaml
+CONFIG ?= strokes/forbes
 BIN := .venv/bin
 
 .PHONY: fit compare test lint faults bench clean
 .DELETE_ON_ERROR:
 
 fit: .venv/installed
-	$(BIN)/forbes fit --config $(CONFIG)
+	$(BIN)/forbes fit $(CONFIG)
 
 # Interrupted, it goes on where it stopped.
 compare: .venv/installed
-	$(BIN)/forbes compare configs/strokes/rssm.yaml configs/strokes/forbes.yaml -o runs/compare --futures 200
+	$(BIN)/forbes compare strokes/rssm strokes/forbes -o runs/compare --futures 200
 	$(BIN)/forbes figures strokes --runs runs/compare/forbes-0 runs/compare/rssm-0 -o runs/compare/figures
 
 test: .venv/installed-dev

@@ -14,7 +14,7 @@ _PUBLIC = {
     "data": "Experience Replay SequenceBatch SequenceDataModule Simulated Strokes",
     "envs": "DeepMindControl Gymnasium find_environment",
     "errors": "ForbesError",
-    "evaluation": "complete evaluate filter imagine",
+    "evaluation": "CalibrationError ELBO PLL complete evaluate filter imagine",
     "models": "Bernoulli ConvDecoder ConvEncoder MLPDecoder MLPEncoder ModelParts Normal OneHot OnePixel "
     "ParticleModel PixelDecoder PixelEncoder StateSpaceModel VectorModel VectorNormal",
     "pomdps": "LightDark LinearGaussian MirrorSensor MountainHike TMaze Tiger Ungm",

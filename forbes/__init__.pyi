@@ -16,7 +16,15 @@ from forbes.data import (
 )
 from forbes.envs import DeepMindControl as DeepMindControl, Gymnasium as Gymnasium, find_environment as find_environment
 from forbes.errors import ForbesError as ForbesError
-from forbes.evaluation import complete as complete, evaluate as evaluate, filter as filter, imagine as imagine
+from forbes.evaluation import (
+    ELBO as ELBO,
+    PLL as PLL,
+    CalibrationError as CalibrationError,
+    complete as complete,
+    evaluate as evaluate,
+    filter as filter,
+    imagine as imagine,
+)
 from forbes.models import (
     Bernoulli as Bernoulli,
     ConvDecoder as ConvDecoder,

@@ -15,6 +15,7 @@ import pytest
 from forbes.commands.parsers import compare
 from forbes.data.episodes.store import EpisodeStore
 from forbes.evaluation.record import read_record
+from forbes.runs.configs import find_config
 from forbes.runs.folder import RunFolder
 
 ROOT = Path(__file__).parents[1]
@@ -127,8 +128,8 @@ def test_the_comparison_of_a_recipe_is_one_that_can_be_made(monkeypatch):
 
     *others, yours = compare.parser().parse_args(command.split()).configs
 
-    assert all(map(os.path.isfile, others))
-    assert f"> {yours}\n" in TEXT
+    assert [find_config(name).stem for name in others] == ["rssm", "forbes"]
+    assert f"> configs/{yours}.yaml\n" in TEXT
 
 
 def test_a_place_that_is_not_there_is_no_edit(tmp_path):

@@ -62,9 +62,17 @@ def test_every_public_name_can_be_imported(name):
 
 
 def test_importing_forbes_imports_nothing_heavy():
-    program = (
-        "import sys, forbes; dir(forbes); print(*{'torch', 'lightning', 'numpy', 'jsonargparse'} & {*sys.modules})"
-    )
+    heavy = {"torch", "lightning", "numpy", "jsonargparse", "mujoco"}
+    program = f"import sys, forbes; dir(forbes); print(*{heavy} & {{*sys.modules}})"
+
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+
+    assert done.stdout.strip() == ""
+
+
+def test_training_without_the_control_suite_does_not_import_it():
+    """MuJoCo chooses its rendering when it is imported, and fails on a machine that has none."""
+    program = "import sys, forbes.commands.fit; print(*{'dm_control', 'mujoco', 'OpenGL'} & {*sys.modules})"
 
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
 

@@ -17,6 +17,7 @@ from forbes.evaluation.predictions import first_of_each_class
 from forbes.figures.grids import require_images
 from forbes.figures.style import save_figure
 from forbes.models import StateSpaceModel
+from forbes.runs.loggers import show_picture, shows
 from forbes.seeding import derive_seed, forked
 from forbes.training.world_model import WorldModel
 
@@ -34,7 +35,8 @@ class FileCallback(Callback, ABC):
     """Writes a file in the run's `figures/` after every k-th epoch and at the end of the fit.
 
     It uses its own random numbers, so a training with it is bitwise the same as one without. The file of an epoch is
-    written at the start of the next one, when all metrics of the epoch are logged.
+    written at the start of the next one, when all metrics of the epoch are logged. Loggers of TensorBoard and W&B show
+    it too, as `figures/NAME`.
 
     Args:
         every: number of epochs between files, k.
@@ -67,6 +69,9 @@ class FileCallback(Callback, ABC):
         with _own_randomness(module, self.filename):
             path = Path(folder) / "figures" / self.filename
             self.write(trainer, cast(WorldModel, module), datamodule_of(trainer), path)
+        for logger in trainer.loggers:
+            if shows(logger, self.filename):
+                show_picture(logger, path, trainer.global_step)
 
 
 class PictureCallback(FileCallback):

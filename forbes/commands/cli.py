@@ -23,12 +23,15 @@ class Command(NamedTuple):
     target: str
 
 
-_TRAINED = "--config RUN/config.yaml --ckpt_path RUN/checkpoints/last.ckpt"
+_TRAINED = "RUN/config.yaml --ckpt_path RUN/checkpoints/last.ckpt"
 COMMANDS = {
-    "fit": Command("train a model", "--config configs/strokes/forbes.yaml", "forbes.commands.fit:fit"),
+    "fit": Command("train a model", "strokes/forbes", "forbes.commands.fit:fit"),
     "validate": Command("run the validation loop of a model", _TRAINED, "forbes.commands.fit:validate"),
     "test": Command("run the test loop of a model", _TRAINED, "forbes.commands.fit:test"),
     "predict": Command("run the prediction loop of a model", _TRAINED, "forbes.commands.fit:predict"),
+    "configs": Command(
+        "list, show and copy configurations", "copy strokes/forbes mine.yaml", "forbes.commands.configs:main"
+    ),
     "replay": Command("show where a training diverged", "RUN/failure.pt", "forbes.commands.replay:main"),
     "evaluate": Command("evaluate trained models and compare them", "RUN RUN", "forbes.commands.evaluate:main"),
     "rollout": Command("record an agent as a GIF", "RUN --video agent.gif", "forbes.commands.rollout:main"),
@@ -36,7 +39,7 @@ COMMANDS = {
     "theorem": Command("check Theorem 1 in closed form", "--steps 30", "forbes.commands.theorem:main"),
     "compare": Command(
         "train several configurations and compare them",
-        "configs/strokes/rssm.yaml configs/strokes/forbes.yaml --seeds 3",
+        "strokes/rssm strokes/forbes --seeds 3",
         "forbes.commands.compare:main",
     ),
     "calibrate": Command("check a filter against its own model", "RUN -o figures", "forbes.commands.calibrate:main"),

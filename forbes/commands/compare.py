@@ -24,6 +24,7 @@ from forbes.figures.comparison import draw_differences, draw_per_step, draw_scor
 from forbes.figures.style import save_png_and_pdf
 from forbes.files import replace_file
 from forbes.runs.checkpoint import open_checkpoint
+from forbes.runs.configs import find_config
 from forbes.runs.configuration import allowed_modules
 from forbes.runs.folder import RunFolder, read_config
 from forbes.runs.provenance import command_line, commit
@@ -70,8 +71,7 @@ def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, 
     """Return the run folders of each configuration by seed; a configuration is named after its file."""
     names = [Path(config).stem for config in configs]
     for config, name in zip(configs, names, strict=True):
-        if not Path(config).is_file():
-            raise ForbesError(f"{config}: no such configuration. Name a YAML file, e.g. configs/strokes/forbes.yaml")
+        find_config(config)
         if names.count(name) > 1:
             raise ForbesError(f"{config}: another configuration is called {name} too. Give the files different names")
     return {name: {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)} for name in names}

@@ -6,8 +6,6 @@ import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -21,17 +19,26 @@ from forbes.data.strokes.classifiers import classifiers_path
 from forbes.data.strokes.dejong import dejong_path
 from forbes.data.strokes.source import bundled_path
 from forbes.envs.rendering import BACKENDS, probe_backend
+from forbes.runs.configs import config_folder
 
 __all__ = ["main"]
 
 _DRIVER_LIMIT = 30.0
 """Timeout of nvidia-smi in seconds; it takes a few seconds to wake a GPU."""
-REQUIRED = ("torch", "lightning", "jsonargparse", "numpy", "matplotlib", "pandas")
+REQUIRED = (
+    "torch",
+    "lightning",
+    "torchmetrics",
+    "jsonargparse",
+    "numpy",
+    "matplotlib",
+    "pandas",
+    "dm-control",
+    "mujoco",
+)
 OPTIONAL = {
     "scikit-image": "build",
     "tensorboard": "tracking",
-    "dm-control": "dmc",
-    "mujoco": "dmc",
     "gymnasium": "gym",
 }
 
@@ -107,9 +114,7 @@ def _driver(program: str) -> str:
 
 
 def _rendering() -> Iterator[Finding]:
-    """Try every rendering backend, that of MUJOCO_GL first; skip this without dm-control."""
-    if find_spec("dm_control") is None:
-        return
+    """Try every rendering backend, that of MUJOCO_GL first."""
     asked = os.environ.get("MUJOCO_GL")
     if asked:
         yield Finding("MUJOCO_GL", asked)
@@ -120,9 +125,7 @@ def _rendering() -> Iterator[Finding]:
 
 
 def _data() -> Iterator[Finding]:
-    package = Path(forbes.__file__).parent
-    shipped = package / "configs" if (package / "configs").is_dir() else package.parent / "configs"
-    yield Finding("configurations", str(shipped))
+    yield Finding("configurations", str(config_folder()))
     for name, path, remedy, needed in (
         ("strokes, bundled", bundled_path(), "forbes data build-strokes --images DIR", True),
         ("digit classifiers", classifiers_path(), "reinstall forbes, if you need forbes completions", False),

@@ -11,11 +11,19 @@ from torch import Tensor
 
 from forbes.choices import PASSES, SUBSET, Split
 from forbes.commands.parsers.evaluate import parser
-from forbes.commands.tables import print_agents, print_degradation, print_pairs, print_references, print_runs
+from forbes.commands.tables import (
+    print_agents,
+    print_degradation,
+    print_images,
+    print_pairs,
+    print_references,
+    print_runs,
+)
 from forbes.data import Simulated
 from forbes.errors import ForbesError
 from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.image_scores import futures_of, image_curves, image_rows, score_images
 from forbes.evaluation.metrics import SCORES, EvaluatedRun, compare_pairs, record_differences
 from forbes.evaluation.record import describe, require_readable, results_folders, write_record
 from forbes.evaluation.references import references
@@ -67,6 +75,7 @@ def main(argv: Sequence[str]) -> None:
     if len(measured) > 1:
         print_pairs(compare_pairs(measured))
     print_degradation(measured)
+    print_images(measured)
 
 
 def evaluate(
@@ -93,16 +102,16 @@ def evaluate(
             _measure(evaluated, job, job.sha256[number], args, parts)
             finished.append(parts)
         _add_references(evaluated, jobs, args.split)
+        evaluated = evaluated._replace(images=_image_entries(run, jobs, number, args))
         about = origin(command, args.seed) | {"parameters": run.parameters}
-        for entry in evaluated.entries.values():
+        for entry in (*evaluated.entries.values(), *evaluated.images.values()):
             entry.update(about)
         measured.append(evaluated)
     for first, second, differences in compare_pairs(measured):
         record_differences(first, second, differences)
     for evaluated in measured:
-        write_record(
-            folders[evaluated.run.path], evaluated.entries | _round_trip(evaluated.run, args), evaluated.totals
-        )
+        entries = {**evaluated.entries, **evaluated.images, **_round_trip(evaluated.run, args)}
+        write_record(folders[evaluated.run.path], entries, evaluated.totals)
     for parts in finished:
         parts.remove()
     return measured
@@ -120,6 +129,23 @@ def _add_references(evaluated: EvaluatedRun, jobs: Sequence[_Job], split: Split)
                 name: Estimate.of(values[:, job.score.context :].sum(1))._asdict()
                 for name, values in found[job.sequences].items()
             }
+
+
+def _image_entries(run: TrainedRun, jobs: Sequence[_Job], number: int, args: Any) -> dict[str, dict[str, Any]]:
+    """Return the entries of PSNR and SSIM of run `number`, by metric; {} without images or an open-loop score."""
+    job = next((job for job in jobs if job.name == "open-loop"), None)
+    if job is None or len(run.data.observation_shape) != 3:
+        return {}
+    began, futures = time.monotonic(), futures_of(run.model, args.futures)
+    batches = split_batches(run.data, args.split, job.sequences, image_rows(run.data.length - args.context))
+    batches = with_progress(batches, f"{run.path} images", job.sequences)
+    found = score_images(run.model, run.data.source, batches, args.context, futures, args.seed)
+    about = {"sequences": job.sequences, **_about(run, job.sha256[number], began)}
+    job = job._replace(score=job.score._replace(tag=f"K={futures},c={args.context}"))
+    return {
+        _metric_name(run, job, metric, args.split): {"unit": unit, **curves, **about}
+        for metric, unit, curves in image_curves(found)
+    }
 
 
 class WantedMetrics(NamedTuple):
@@ -251,9 +277,14 @@ def _measure(evaluated: EvaluatedRun, job: _Job, sha256: str, args: Any, parts: 
     for metric in score.metrics:
         name = _metric_name(run, job, metric, args.split)
         evaluated.totals[name] = scores.total(metric)
-        evaluated.entries[name] = describe(scores, metric) | {
-            "data": {"name": data_name(run.data), "sha256": sha256},
-            "checkpoint": run.checkpoint,
-            "device": str(next(run.model.parameters()).device),
-            "seconds": round(time.monotonic() - began, 1),
-        }
+        evaluated.entries[name] = describe(scores, metric) | _about(run, sha256, began)
+
+
+def _about(run: TrainedRun, sha256: str, began: float) -> dict[str, Any]:
+    """Return what was measured, where, and for how long."""
+    return {
+        "data": {"name": data_name(run.data), "sha256": sha256},
+        "checkpoint": run.checkpoint,
+        "device": str(next(run.model.parameters()).device),
+        "seconds": round(time.monotonic() - began, 1),
+    }

@@ -17,14 +17,16 @@ from jsonargparse import DefaultHelpFormatter
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import CheckpointIO
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.callbacks import Callback, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 import forbes.callbacks  # registers their short names for configurations
 from forbes.bundled import is_pretrained
 from forbes.callbacks.divergence import StopAtDivergence
+from forbes.callbacks.picture import FileCallback
 from forbes.commands.lower_rate import MOST, LowerRateError, at_half_the_rate
 from forbes.commands.parsers.fit import DESCRIPTION, run_options
 from forbes.commands.trainer_arguments import require_usable
@@ -32,6 +34,7 @@ from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.runs.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
 from forbes.runs.config_errors import building, one_sentence, raised_inside, said_by_lightning
+from forbes.runs.configs import with_config_paths
 from forbes.runs.configuration import (
     add_links,
     add_seed,
@@ -41,7 +44,7 @@ from forbes.runs.configuration import (
     require_classes,
 )
 from forbes.runs.folder import RunFolder, experiment_name, read_config
-from forbes.runs.loggers import ParserOfRuns, open_logger
+from forbes.runs.loggers import ParserOfRuns, open_logger, shows
 from forbes.runs.metrics_log import JsonLinesLogger, MarkStart
 from forbes.runs.modules import check_weights, weights_of
 from forbes.runs.progress import progress
@@ -102,13 +105,14 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     for name in ("profilers.profiler", "callbacks.model_summary"):  # the user has requested their output
         logging.getLogger(f"lightning.pytorch.{name}").setLevel(logging.INFO)
     allow_modules()
+    with_paths = with_config_paths(arguments)
     with ExitStack() as stack, warnings.catch_warnings():
         for message in _NOT_OURS:
             warnings.filterwarnings("ignore", message)
         try:
-            return _Experiment(command, arguments, stack).execute()
+            return _Experiment(command, arguments, with_paths, stack).execute()
         except argparse.ArgumentError as error:
-            raise ForbesError(one_sentence(str(error), arguments)) from error
+            raise ForbesError(one_sentence(str(error), with_paths)) from error
         except (MisconfigurationException, ImportError, RuntimeError, TypeError, ValueError) as error:
             if inner := raised_inside(error):
                 raise inner from None
@@ -155,16 +159,17 @@ class _Experiment(LightningCLI):
 
     Args:
         command: fit, validate, test or predict.
-        arguments: options of the command.
+        arguments: options of the command, as they are recorded.
+        with_paths: the same, with `--config PATH` for each configuration.
         stack: exit stack that holds the lock of the run folder; closed when the command ends.
     """
 
-    def __init__(self, command: str, arguments: Sequence[str], stack: ExitStack) -> None:
-        self.command, self.arguments, self.stack = command, arguments, stack
+    def __init__(self, command: str, arguments: Sequence[str], with_paths: Sequence[str], stack: ExitStack) -> None:
+        self.command, self.arguments, self.with_paths, self.stack = command, arguments, with_paths, stack
         self.stop: StopOnSignal | None = None
-        self.options, configuration = _FitOptions(), list(arguments)
+        self.options, configuration = _FitOptions(), list(with_paths)
         if command == "fit":
-            self.options, configuration = _FitOptions.parse(arguments)
+            self.options, configuration = _FitOptions.parse(with_paths)
         super().__init__(
             model_class=LightningModule,
             datamodule_class=SequenceDataModule,
@@ -172,7 +177,7 @@ class _Experiment(LightningCLI):
             trainer_defaults={"devices": 1, "enable_model_summary": False},
             parser_kwargs={
                 "prog": f"forbes {self.command}",
-                "usage": f"forbes {self.command} --config FILE [--OPTION VALUE ...]",
+                "usage": f"forbes {self.command} CONFIG [CONFIG ...] [--OPTION VALUE ...]",
                 "formatter_class": _Help,
                 "description": DESCRIPTION[self.command],
                 "epilog": run_options().format_help() if self.command == "fit" else None,
@@ -217,7 +222,7 @@ class _Experiment(LightningCLI):
 
     def _where(self) -> str:
         """Return the configuration files, for error messages."""
-        files = [value for flag, value in itertools.pairwise(self.arguments) if flag in ("--config", "-c", "--resume")]
+        files = [value for flag, value in itertools.pairwise(self.with_paths) if flag in ("--config", "--resume")]
         return " and ".join(files) or "the configuration"
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
@@ -248,7 +253,9 @@ class _Experiment(LightningCLI):
         loggers = config["logger"]
         if loggers is not False:
             named = _as_list(None if loggers is True else loggers)
-            loggers = [JsonLinesLogger(run.metrics), *(open_logger(logger, run.path) for logger in named)]
+            opened = [open_logger(logger, run.path) for logger in named]
+            _tell_hidden_pictures(opened, callbacks, run)
+            loggers = [JsonLinesLogger(run.metrics), *opened]
         return {"logger": loggers, "default_root_dir": config["default_root_dir"] or run.path}
 
     def _open_run(self) -> RunFolder:
@@ -305,6 +312,14 @@ class _Experiment(LightningCLI):
         trainer = self.config["trainer"]
         names = [name for name in _LIMITS if trainer[name] not in (None, -1)]
         return ", ".join(f"{name} {trainer[name]}" for name in names)
+
+
+def _tell_hidden_pictures(loggers: Sequence[Logger], callbacks: Sequence[Callback], run: RunFolder) -> None:
+    """Print which pictures of the callbacks a logger does not show."""
+    names = [callback.filename for callback in callbacks if isinstance(callback, FileCallback)]
+    for logger in loggers:
+        if hidden := [name for name in names if not shows(logger, name)]:
+            print(f"{type(logger).__name__} does not show {', '.join(hidden)}; see {run.figures}", flush=True)
 
 
 def _print_metrics(found: Sequence[Mapping[str, float]]) -> None:

@@ -16,7 +16,8 @@ from forbes.evaluation.metrics import EvaluatedRun, Pair, at_horizons, degradati
 from forbes.evaluation.references import lowest_above
 from forbes.evaluation.reward_prediction import STEPS_AHEAD
 
-__all__ = ["beaten_by", "print_agents", "print_degradation", "print_pairs", "print_references", "print_runs"]
+__all__ = ["beaten_by", "print_agents", "print_degradation", "print_images", "print_pairs", "print_references"]
+__all__ += ["print_runs"]
 
 
 def print_runs(measured: Sequence[EvaluatedRun]) -> None:
@@ -83,6 +84,24 @@ def print_degradation(measured: Sequence[EvaluatedRun]) -> None:
             for path, row in rows.items()
         }
         _print(console(200), f"{metric}: nats that a prediction loses, by steps after the last observation", columns)
+
+
+def print_images(measured: Sequence[EvaluatedRun]) -> None:
+    """Print PSNR and SSIM one step and every five steps after the context, next to those of the last frame."""
+    for name, entry in measured[0].images.items():
+        digits, unit = (1, " in dB") if entry["unit"] == "dB" else (3, "")
+        shown = [steps for steps in range(1, len(entry["model"]) + 1) if steps == 1 or steps % 5 == 0]
+        curves = {str(number): each.images.get(name, {}).get("model") for number, each in enumerate(measured, start=1)}
+        columns = {
+            header: {f"{steps} steps": _image_score(curve[steps - 1], digits) for steps in shown} if curve else {}
+            for header, curve in (curves | {"last frame": entry["last frame"]}).items()
+        }
+        title = f"{name}: score of the mean prediction as an image{unit}, by steps after the last observation"
+        _print(console(200), title, columns)
+
+
+def _image_score(value: float | None, digits: int) -> str:
+    return "exact" if value is None else f"{value:.{digits}f}"
 
 
 def _print(screen: Console, title: str, columns: Mapping[str, Mapping[str, str]]) -> None:

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -70,8 +69,6 @@ class DeepMindControl(Environment):
         backend: str | None = None,
     ) -> None:
         require_repeat(task, action_repeat)
-        if find_spec("dm_control") is None:  # before the backends are probed, which would all fail for this reason
-            raise ForbesError(f"{task}: dm_control is not installed. pip install 'forbes[dmc]'")
         self.task, self.pixels, self.action_repeat, self.size, self.fast = task, pixels, action_repeat, size, fast
         self.backend = (backend or choose_backend().backend) if pixels else _NO_RENDERING
         self._environment = _load(task, self.backend)

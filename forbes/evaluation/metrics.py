@@ -43,6 +43,8 @@ class EvaluatedRun(NamedTuple):
     """Entries of `evaluation.json`, by metric."""
     totals: dict[str, Tensor]
     """Score of each sequence, `(N,)`, by metric."""
+    images: Mapping[str, dict[str, Any]] = {}
+    """Entries of the PSNR and the SSIM; empty if they were not measured."""
 
 
 class Pair(NamedTuple):

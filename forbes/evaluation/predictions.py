@@ -7,10 +7,11 @@ from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Split, Strokes
 from forbes.errors import ForbesError
-from forbes.models import BeliefModel, Rollout, State, StateSpaceModel
+from forbes.models import BeliefModel, EncodedSequence, Rollout, State, StateSpaceModel
 from forbes.shapes import printed_by_shape
 
-__all__ = ["Completions", "complete", "filter", "first_of_each_class", "imagine", "open_loop_frames", "whole_sequences"]
+__all__ = ["Completions", "complete", "expected_frames", "filter", "first_of_each_class", "imagine", "open_loop_frames"]
+__all__ += ["whole_sequences"]
 
 
 @printed_by_shape
@@ -109,17 +110,51 @@ def complete(
         >>> forbes.complete(model, data.source, batch, context=15, samples=10).frames.shape
         torch.Size([10, 8, 15, 1, 28, 28])
     """
-    sequences = len(batch.observation)
     encoded = model.encode(batch.observation[:, :context], batch.action[:, :context])
+    frames = _futures(model, source, batch, encoded, samples, draw=source.increments and not mean)
+    return Completions(frames, context)
+
+
+@torch.no_grad()
+def expected_frames(
+    model: BeliefModel, source: SequenceSource, batch: SequenceBatch, context: int, futures: int
+) -> Tensor:
+    r"""Return the mean of K futures, an unbiased estimate of :math:`E[o_t \mid o_{1:c}]`, `(B, T - c, C, H, W)`.
+
+    If observations are increments, it is that of the drawing so far. Given a trajectory of (h, s) the expectation is
+    exact, since its frames are then independent.
+
+    Args:
+        model: model on the batch's device.
+        source: data source of the batch.
+        batch: B sequences of T steps, T above `context`.
+        context: number of steps that the model sees, c.
+        futures: number of futures, K, in whole sets of particles. A model without randomness has one.
+    """
+    encoded = model.encode(batch.observation[:, :context], batch.action[:, :context])
+    passes = model.num_belief_samples(futures)
+    total: Tensor = _futures(model, source, batch, encoded, model.particles, draw=False).mean(0)
+    for _ in range(passes - 1):  # one at a time: the memory does not grow with K
+        total += _futures(model, source, batch, encoded, model.particles, draw=False).mean(0)
+    return total / passes
+
+
+def _futures(
+    model: BeliefModel, source: SequenceSource, batch: SequenceBatch, encoded: EncodedSequence, samples: int, draw: bool
+) -> Tensor:
+    """Roll out N belief samples after the encoded steps and return their frames, `(N, B, T - context, C, H, W)`.
+
+    Frames are drawn from the likelihood, or are its mean.
+    """
+    context = encoded.action.shape[1]
     start = model.sample_beliefs(encoded, samples)  # (N B, ...)
     action = batch.action[:, context:].repeat(samples, 1, 1)  # (N B, T - context, A)
     output = model.decode(model.imagine(start, action).features)  # (N B, T - context, C, H, W)
-    draw = source.increments and not mean
-    frames = model.likelihood.sample(output) if draw else model.likelihood.mean(output)
+    frames: Tensor = model.likelihood.sample(output) if draw else model.likelihood.mean(output)
     if source.increments:
         before = batch.observation[:, :context].repeat(samples, 1, 1, 1, 1)  # (N B, context, C, H, W)
         frames = source.pictures(torch.cat((before.to(frames.dtype), frames), 1))[:, context:]
-    return Completions(frames.unflatten(0, (samples, sequences)), context)
+    return frames.view(samples, len(batch.observation), *frames.shape[1:])  # (N, B, T - context, C, H, W)
 
 
 @torch.no_grad()

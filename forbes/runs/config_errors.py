@@ -60,19 +60,17 @@ def _complaint(message: str, keys: list[str]) -> _Complaint:
     return _Complaint(".".join(keys), _wrong_value(message))
 
 
-def _missing_flag(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
-    return _Complaint("", f"a configuration needs its flag. Write: --config {match[1]}", match[1])
-
-
-def _missing_file(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
-    return _Complaint("", "no such file. The configurations of forbes are in configs/", match[1])
+def _surplus_word(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
+    return _Complaint(
+        "", "is not a flag. Configurations come first: forbes fit CONFIG [CONFIG ...] [--KEY VALUE ...]", match[1]
+    )
 
 
 def _missing_argument(match: re.Match[str], message: str, keys: list[str]) -> _Complaint:
     """Explain a missing argument of a class, or a missing configuration."""
     key = ".".join(keys)
     remedy = (
-        f"give it: --{key}.{match[1]} VALUE" if key else "give a configuration: --config configs/strokes/forbes.yaml"
+        f"give it: --{key}.{match[1]} VALUE" if key else "name a configuration first, e.g. forbes fit strokes/forbes"
     )
     return _Complaint(key, f"{match[1]} missing, {remedy}")
 
@@ -110,12 +108,11 @@ def _untrusted_class(match: re.Match[str], message: str, keys: list[str]) -> _Co
 
 
 _RULES: tuple[tuple[str, Callable[[re.Match[str], str, list[str]], _Complaint]], ...] = (
-    (r"unrecognized arguments: (\S+\.ya?ml)\b", _missing_flag),
+    (r"unrecognized arguments: ([^-\s]\S*)", _surplus_word),
     (r"[Oo]ption '([\w.]+)'|unrecognized arguments: --([\w.]+)", _unknown_option),
     (r"Expected a dot import path string: (\S*)|has no attribute '(\w+)'", _unknown_class),
     (r"Importing '([\w.]+)' is not allowed", _untrusted_class),
     (r"arguments are required: ([\w., ]+)", _missing_argument),
-    (r"File does not exist: '(.*)'", _missing_file),
 )
 """Patterns in the messages of jsonargparse 4.53, and the functions that explain them."""
 
@@ -176,7 +173,7 @@ def _place(key: str, arguments: Sequence[str]) -> str:
     flags = [argument.split("=")[0].replace(".init_args", "") for argument in arguments if argument.startswith("--")]
     if key and f"--{key}" in flags:
         return ""
-    configs = [value for flag, value in itertools.pairwise(arguments) if flag in ("--config", "-c")]
+    configs = [value for flag, value in itertools.pairwise(arguments) if flag == "--config"]
     word = re.compile(rf"\b{re.escape(key.rpartition('.')[2])}\b")
     for config in configs[::-1]:
         if len(configs) == 1 or word.search(Path(config).read_text(errors="replace")):

@@ -93,7 +93,7 @@ class RunFolder:
             existing = sorted(path.name for path in run.checkpoint.parent.glob("*.ckpt"))
             raise ForbesError(f"{run.checkpoint}: no such checkpoint. There are {', '.join(existing) or 'none'}")
         if not run.checkpoint.is_file():
-            raise ForbesError(f"{run}: has no checkpoint yet. Train it: forbes fit --config {run.config}")
+            raise ForbesError(f"{run}: has no checkpoint yet. Train it: forbes fit {run.config}")
         require_no_links(path for path in run.path.iterdir() if path.is_dir())
         return run
 

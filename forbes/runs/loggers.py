@@ -1,15 +1,17 @@
-"""Loggers of a configuration, which write to the run folder unless the configuration names another folder."""
+"""Loggers of a configuration: they write to the run folder unless it names another, and show pictures if they can."""
 
 import inspect
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jsonargparse import Namespace
 from lightning.pytorch.cli import LightningArgumentParser
-from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from PIL import Image
 
-__all__ = ["ParserOfRuns", "open_logger"]
+__all__ = ["ParserOfRuns", "open_logger", "show_picture", "shows"]
 
 _FOLDERS = ("save_dir", "root_dir")
 """Names of the argument for a logger's folder."""
@@ -27,9 +29,9 @@ class ParserOfRuns(LightningArgumentParser):
         completed = namespace.clone()
         loggers = completed.get("trainer.logger")
         for logger in loggers if isinstance(loggers, list) else [loggers]:
-            arguments = logger.get("init_args") if isinstance(logger, Namespace) else {}
+            arguments = logger.get("init_args") if isinstance(logger, Namespace) else None
             for name in _FOLDERS:
-                if name in arguments and arguments[name] is None:
+                if arguments and name in arguments and arguments[name] is None:
                     arguments[name] = "the run folder"
         super().validate(completed, *args, **kwargs)
 
@@ -56,3 +58,28 @@ def open_logger(logger: "partial[Logger]", run: Path) -> Logger:
         if name in parameters and given in (None, parameters[name].default):
             return logger(**{name: str(run / (given or ""))})
     return logger()
+
+
+def shows(logger: Logger, filename: str) -> bool:
+    """Return whether a logger shows files of this name: W&B pictures and videos (.gif), TensorBoard pictures."""
+    if filename.endswith(".gif"):
+        return hasattr(logger, "log_video")
+    return isinstance(logger, TensorBoardLogger) or hasattr(logger, "log_image")
+
+
+def show_picture(logger: Logger, path: Path, step: int) -> None:
+    """Send a file to a logger that `shows` it, as `figures/NAME`.
+
+    Args:
+        logger: logger of TensorBoard, or with the methods `log_image` and `log_video` of Lightning's `WandbLogger`.
+        path: picture, or a video as .gif.
+        step: number of updates.
+    """
+    name = f"figures/{path.stem}"
+    if isinstance(logger, TensorBoardLogger):
+        picture = np.asarray(Image.open(path).convert("RGB"))  # (H, W, 3)
+        logger.experiment.add_image(name, picture, step, dataformats="HWC")
+    elif path.suffix == ".gif":
+        logger.log_video(name, [str(path)], step=step)  # type: ignore[attr-defined]
+    else:
+        logger.log_image(name, [str(path)], step=step)  # type: ignore[attr-defined]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from jsonargparse import Namespace
 from lightning import LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, SaveConfigCallback
@@ -31,7 +32,7 @@ from forbes.runs.stop import StopOnSignal
 __all__ = ["RecordRun", "command_line", "commit", "origin", "read_provenance"]
 
 PACKAGES = ("torch", "lightning", "jsonargparse", "numpy", "dm-control", "mujoco", "gymnasium")
-"""Packages that may change the results of a run; the last three are optional."""
+"""Packages that may change the results of a run; gymnasium is optional."""
 
 
 class RecordRun(SaveConfigCallback):
@@ -60,8 +61,11 @@ class RecordRun(SaveConfigCallback):
         self._began = time.monotonic()
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Write both files before the training starts."""
-        replace_file(self.run.config, self.parser.dump(self.config, skip_unset=False).encode())
+        """Write both files before the training starts, and log the configuration as hyperparameters."""
+        content = self.parser.dump(self.config, skip_unset=False)
+        replace_file(self.run.config, content.encode())
+        for logger in trainer.loggers:
+            logger.log_hyperparams(yaml.safe_load(content))
         path = self.run.provenance
         self._entries = read_provenance(path) if path.is_file() else []
         seed = {"seed": self.config["seed_everything"]}

@@ -158,5 +158,5 @@ def _require_density(process: Process, objective: Objective) -> None:
 def _not_its_data(process: Process, found: str) -> ForbesError:
     return ForbesError(
         f"KnownBelief: the data are {found}, expected those of its {process}. Give model and data the "
-        "same process, as configs/pomdp does"
+        "same process, as pomdp/NAME/known_gaussian does"
     )

@@ -149,8 +149,8 @@ class WorldModel(SeededModule):
 
         Args:
             data: the data that the model learns.
-            **options: arguments of the constructor by name. The others have the values of `configs/` for such data
-                (see `defaults_for`).
+            **options: arguments of the constructor by name. The others have the values of our configurations for such
+                data (see `defaults_for`).
         """
         of_data = {"observation_shape": data.observation_shape, "action_dim": data.action_dim, "seed": data.seed}
         arguments: dict[str, Any] = of_data | defaults_for(data.source) | options

@@ -78,7 +78,7 @@ def test_what_follows_two_dashes_asks_for_no_help(capsys):
     assert "absent.yaml: no such configuration" in error_of(capsys, "compare", "absent.yaml", "--", "--help")
 
 
-EXAMPLES = re.findall(r"^  forbes (fit --config .*?)(?:  +#.*)?$", help_page("fit"), re.MULTILINE)
+EXAMPLES = re.findall(r"^  forbes (fit strokes.*?)(?:  +#.*)?$", help_page("fit"), re.MULTILINE)
 CHANGED = re.findall(r"(--(?:model|data|trainer|seed)[\w.]+) ([\w.-]+)", help_page("fit").split("\n\n")[3])
 
 
@@ -177,7 +177,7 @@ def test_misspelt_arguments_of_a_class_are_named(tiny_config, tmp_path, capsys):
         (["--batch_size", "1"], "batch_size: the configuration has no such option, did you mean data.batch_size?"),
         (["--points_per_step", "2"], "did you mean data.source.points_per_step?"),
         (["--exploration", "0"], "did you mean model.exploration?"),
-        (["mine.yaml"], "mine.yaml: a configuration needs its flag. Write: --config mine.yaml"),
+        (["mine.yaml"], "mine.yaml: is not a flag. Configurations come first: forbes fit CONFIG"),
         (
             ["--trainer.logger", "TensorBoardLogger", "--trainer.logger.savedir", "logs"],
             "trainer.logger.savedir: TensorBoardLogger has no such option, did you mean save_dir?",
@@ -198,8 +198,8 @@ def test_misspelt_arguments_of_a_class_are_named(tiny_config, tmp_path, capsys):
         (["--data.batch_size", "-1"], "batch_size is -1, expected at least 1"),
         (["--data.batch_size", "21"], "batch_size is 21, but the training split has 20 sequences"),
         (["--trainer.devices", "0"], "devices"),
-        (["surplus"], "unrecognized arguments: surplus"),
-        (["--config", "absent.yaml"], "absent.yaml: no such file"),
+        (["surplus"], "surplus: is not a flag"),
+        (["--config", "absent.yaml"], "absent.yaml: no such configuration"),
         (["--resume", "absent"], "absent: no such run folder"),
         (["--run_dir", "/proc/run"], "/proc/run: no such file or directory"),
         (["--resume", "a", "--run_dir", "b"], "not allowed with argument"),

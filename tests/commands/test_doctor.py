@@ -72,7 +72,6 @@ def test_the_doctor_takes_no_arguments(argument, capsys):
 
 
 def test_backends_are_tried_and_a_broken_one_has_its_remedy(capsys, monkeypatch):
-    pytest.importorskip("dm_control")
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("MUJOCO_GL", "wgl")
 

@@ -209,7 +209,6 @@ def test_what_cannot_be_is_one_sentence(arguments, sentence, in_tmp_path, capsys
 
 
 def test_a_misspelt_task_of_the_suite_gets_a_suggestion(tmp_path, capsys):
-    pytest.importorskip("dm_control")
     arguments = ["collect", "--task", "walker_wlak", "--no-pixels", "-o", tmp_path / "store"]
 
     assert error_of(capsys, "data", *arguments).startswith("walker_wlak: no such task. Did you mean walker_walk")

@@ -166,6 +166,7 @@ def test_all_scores_are_default_and_named_with_their_numbers(runs, capsys):
         *("elbo[bernoulli,S=2]", "reconstruction[bernoulli,S=2]", "kl[bernoulli,S=2]"),
         *("iwae[bernoulli,K=3]", "pll[bernoulli,K=3]", "fivo[bernoulli,K=3]", "ess[bernoulli,K=3]"),
         *("open_loop[bernoulli,K=4,c=2]", "open_loop_marginal[bernoulli,K=4,c=2]"),
+        *("psnr[bernoulli,K=4,c=2]", "ssim[bernoulli,K=4,c=2]"),
     ]
     entries = record(runs[0])
     assert list(entries) == [f"test[:5]/{name}" for name in names]
@@ -176,7 +177,11 @@ def test_all_scores_are_default_and_named_with_their_numbers(runs, capsys):
     assert not any(open_loop["curve"][:2])
     assert open_loop["steps"] == elbo["steps"] - 5 * 2
     assert open_loop["per_step"]["mean"] == pytest.approx(5 * open_loop["mean"] / open_loop["steps"])
+    psnr = entries["test[:5]/psnr[bernoulli,K=4,c=2]"]
+    assert psnr["unit"] == "dB"
+    assert len(psnr["model"]) == len(psnr["last frame"]) == len(open_loop["curve"]) - 2
     out = capsys.readouterr().out
+    assert "test[:5]/psnr[bernoulli,K=4,c=2]: score of the mean prediction as an image in dB" in out
     assert "test[:5]/degradation[bernoulli,K=4,c=2]" in out
     assert all(name in out for name in ("elbo", "iwae", "pll", "fivo", "open_loop", "[bernoulli,K=4,c=2]"))
 
@@ -198,7 +203,7 @@ def test_a_score_that_a_model_does_not_have_is_left_out_and_said(runs, other_fil
 
     full, of_vector, of_particle = (record(run) for run in (runs[1], vector, particle))
     assert list(of_particle) == list(full)
-    assert list(of_vector) == [name for name in full if "pll" in name or "open_loop" in name]
+    assert list(of_vector) == [name for name in full if any(s in name for s in ("pll", "open_loop", "psnr", "ssim"))]
     assert {pair["minus"] for pair in full["test[:5]/pll[bernoulli,K=4]"]["paired"]} == {vector, particle}
     assert {pair["minus"] for pair in full["test[:5]/fivo[bernoulli,K=4]"]["paired"]} == {particle}
     lines = capsys.readouterr().out.splitlines()

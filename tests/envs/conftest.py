@@ -9,7 +9,6 @@ from forbes.errors import ForbesError
 @pytest.fixture(scope="session")
 def backend():
     """Its name; without one, what needs pixels is skipped."""
-    pytest.importorskip("dm_control")
     try:
         return choose_backend().backend
     except ForbesError as error:

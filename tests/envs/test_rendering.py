@@ -25,7 +25,6 @@ def test_a_backend_that_hangs_is_given_up():
 
 
 def test_a_backend_that_does_not_exist_says_why():
-    pytest.importorskip("dm_control")
     probe = probe_backend("nonsense")
 
     assert "MUJOCO_GL" in probe.problem
@@ -68,7 +67,6 @@ def test_a_gpu_that_does_not_draw_is_noticed(monkeypatch):
 
 
 def test_collecting_pixels_without_rendering_is_one_sentence(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("dm_control")
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
 
     status = main(["data", "collect", "--task", "cartpole_balance", "--episodes", "1", "-o", str(tmp_path / "store")])

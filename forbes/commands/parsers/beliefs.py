@@ -11,7 +11,7 @@ __all__ = ["parser"]
 _DESCRIPTION = """\
 Compare learned beliefs of a known process with the exact ones.
 
-  forbes fit --config configs/pomdp/mirror_sensor/known_mixture.yaml --run_dir runs/mixture
+  forbes fit pomdp/mirror_sensor/known_mixture --run_dir runs/mixture
   forbes beliefs runs/mixture
 
 Prints per step, mean and standard error over sequences:

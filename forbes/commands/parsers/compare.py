@@ -10,21 +10,21 @@ __all__ = ["parser"]
 _DESCRIPTION = """\
 Train configurations with several seeds, evaluate all runs on the same sequences, and compare them.
 
-  forbes compare configs/strokes/rssm.yaml configs/strokes/forbes.yaml --seeds 3
-  forbes compare configs/strokes/rssm.yaml configs/strokes/forbes.yaml -o runs/dejong -- --data.source.origin dejong
+  forbes compare strokes/rssm strokes/forbes --seeds 3
+  forbes compare strokes/rssm strokes/forbes -o runs/dejong -- --data.source.origin dejong
 
 Each run has a folder DIR/NAME-SEED. Arguments after -- are passed to every `forbes fit`. Runs that have no scores yet
 are then evaluated as by `forbes evaluate`. Writes comparison.csv, .json and .md, and figures: scores, per-step,
 differences (to the first configuration). If interrupted, the same command resumes where it stopped.
 
-  forbes compare configs/strokes/*.yaml --seeds 5 --jobs 2      # two trainings at a time, a progress line each"""
+  forbes compare strokes/{rssm,forbes,mixture} --seeds 5 --jobs 2     # two trainings at a time, a progress line each"""
 
 
 def parser() -> ArgumentParser:
     """Return the parser of `forbes compare`."""
     command = ArgumentParser("forbes compare", _DESCRIPTION)
     command.add_argument(
-        "configs", nargs="+", metavar="CONFIG", help="configurations; differences are to the first one"
+        "configs", nargs="+", metavar="CONFIG", help="configurations, by name or path; differences are to the first one"
     )
     command.add_argument(
         "--seeds", type=positive, default=1, help="runs per configuration, with seeds 0, 1, … (default: 1)"

@@ -14,12 +14,13 @@ DESCRIPTION = {
 
 _FIT = """\
 examples:
-  forbes fit --config configs/strokes/forbes.yaml
-  forbes fit --config configs/strokes/forbes.yaml --config configs/debug.yaml      # a dry run: later files override
-  forbes fit --config configs/strokes/rssm.yaml --seed_everything 1 --run_dir runs/rssm-1
+  forbes fit strokes/forbes
+  forbes fit strokes/forbes debug      # a dry run: later configurations override
+  forbes fit strokes/rssm --seed_everything 1 --run_dir runs/rssm-1
   forbes fit --resume runs/rssm-1 --trainer.max_epochs 20
 
-Every key of a configuration is a flag, without init_args. The most common ones, with the values of the first example:
+CONFIG is a name that `forbes configs` lists, or the path of a file. Every key of it is a flag, without init_args. The
+most common ones, with the values of the first example:
   --model.belief FlowBelief         belief family; --model.belief.layers 4 sets one of its arguments
   --model.state_dim 8               dimension of the stochastic state; --model.hidden_dim 200 of the recurrent state
   --model.free_nats 0               nats of the KL without cost; --model.kl_warmup 500 updates until its full weight
@@ -32,7 +33,7 @@ Every key of a configuration is a flag, without init_args. The most common ones,
 """
 _OTHERS = """\
 example:
-  forbes {command} --config RUN/config.yaml --ckpt_path RUN/checkpoints/last.ckpt
+  forbes {command} RUN/config.yaml --ckpt_path RUN/checkpoints/last.ckpt
 
 RUN is a run folder written by `forbes fit`. Every key of its configuration is a flag: --data.batch_size 10
 """
@@ -46,7 +47,7 @@ more:
 
 def help_page(command: str) -> str:
     """Return the short help page of a command, with examples and the most common keys."""
-    usage = f"usage: forbes {command} --config FILE [--KEY VALUE ...]\n"
+    usage = f"usage: forbes {command} CONFIG [CONFIG ...] [--KEY VALUE ...]\n"
     body = f"{_FIT}\n{run_options().format_help()}" if command == "fit" else _OTHERS.format(command=command)
     return "\n".join((usage, f"{DESCRIPTION[command]}\n", body, _MORE))
 
