@@ -15,7 +15,8 @@ fit: .venv/installed
 # Interrupted, it goes on where it stopped.
 compare: .venv/installed
 	$(BIN)/forbes compare strokes/rssm strokes/forbes -o runs/compare --futures 200
-	$(BIN)/forbes figures strokes --runs runs/compare/forbes-0 runs/compare/rssm-0 -o runs/compare/figures
+	$(BIN)/forbes figures predictions --runs runs/compare/forbes-0 runs/compare/rssm-0 -o runs/compare/figures
+	$(BIN)/forbes figures elbo --runs runs/compare/forbes-0 runs/compare/rssm-0 -o runs/compare/figures
 
 test: .venv/installed-dev
 	$(BIN)/pytest -q -n auto --maxprocesses 4

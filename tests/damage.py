@@ -12,8 +12,8 @@ from small_strokes import write_strokes
 from forbes.data.episodes.store import EpisodeStore
 from forbes.data.strokes.file import load_strokes
 from forbes.errors import ForbesError
+from forbes.evaluation.published import published_curves
 from forbes.evaluation.record import read_arrays, read_record
-from forbes.figures.returns import published_curves
 from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
 from forbes.runs.folder import read_config, read_metrics
 from forbes.runs.provenance import read_provenance

@@ -15,11 +15,11 @@ from matplotlib.transforms import blended_transform_factory
 from torch import Tensor
 
 from forbes.beliefs import BeliefHead
-from forbes.callbacks.picture import PictureCallback, require_state
+from forbes.callbacks.picture import PictureCallback, colour_of, require_state
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import first_of_each_class
-from forbes.figures.style import BLACK, BLUE, GREY, ORANGE, PAGE, density_map, paper_style
+from forbes.figures.style import BLACK, GREY, PAGE, density_map, paper_style
 from forbes.models import StateSpaceModel
 from forbes.training.world_model import WorldModel
 
@@ -70,7 +70,7 @@ class BeliefPlot(PictureCallback):
             heights = (0.3, *[3.3] * len(index))
             figure = Figure((PAGE, sum(heights)))
             head, *parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat
-            head.legend(handles=_legend(), loc="center", ncols=4)
+            head.legend(handles=_legend(colour_of(model)), loc="center", ncols=4)
             for digit, part in enumerate(parts):
                 rows = part.subplots(3, len(times), squeeze=False, gridspec_kw={"wspace": 0.3, "hspace": 0.22})
                 part.subplots_adjust(left=0.06, right=0.97, bottom=0.11, top=0.95)
@@ -78,7 +78,7 @@ class BeliefPlot(PictureCallback):
                     _draw_frame(rows[0, column], pictures[digit, time], f"t = {time + 1}")
                     prior = self._sample(model.prior, prior_context[digit, time])
                     posterior = self._sample(model.posterior, filtered.context[digit, time])
-                    _draw_beliefs(rows[1, column], rows[2, column], prior, posterior, named=column == 0)
+                    _draw_beliefs(rows[1, column], rows[2, column], prior, posterior, colour_of(model), column == 0)
         return figure
 
     def _sample(self, head: BeliefHead, context: Tensor) -> "_Cloud":
@@ -100,19 +100,19 @@ class _Cloud(NamedTuple):
     """Density on a grid: x, `(X,)`, and y, `(Y,)`, to `(Y, X)`."""
 
 
-def _draw_beliefs(above: Axes, below: Axes, prior: _Cloud, posterior: _Cloud, named: bool) -> None:
-    """Draw prior and posterior in one plane, each in its own frame."""
+def _draw_beliefs(above: Axes, below: Axes, prior: _Cloud, posterior: _Cloud, colour: str, named: bool) -> None:
+    """Draw prior, in grey, and posterior in one plane, each in its own frame."""
     kind, plane = "exact density", "$s_1$, $s_2$"
     if prior.samples.shape[1] > 2:
         prior, posterior, plane = _principal_plane(prior.samples, posterior.samples)
         kind = "KDE"
-    _draw_cloud(above, prior, ORANGE, torch.cat((prior.samples, posterior.samples)))
-    above.plot(*posterior.samples[:_DOTS].numpy().T, ".", color=BLUE, markersize=1, alpha=0.6)
-    _draw_cloud(below, posterior, BLUE, posterior.samples)
+    _draw_cloud(above, prior, GREY, torch.cat((prior.samples, posterior.samples)))
+    above.plot(*posterior.samples[:_DOTS].numpy().T, ".", color=colour, markersize=1, alpha=0.6)
+    _draw_cloud(below, posterior, colour, posterior.samples)
     below.set_xlabel(plane, fontsize=6)
     if named:
-        for axes, name, colour in ((above, "prior", ORANGE), (below, "posterior", BLUE)):
-            axes.set_ylabel(f"{name}, {kind}", color=colour, fontsize=6)
+        for axes, name, its_colour in ((above, "prior", GREY), (below, "posterior", colour)):
+            axes.set_ylabel(f"{name}, {kind}", color=its_colour, fontsize=6)
             at_the_edge = blended_transform_factory(axes.figure.transSubfigure, axes.transAxes)
             axes.yaxis.set_label_coords(0.02, 0.5, transform=at_the_edge)
 
@@ -134,13 +134,13 @@ def _draw_cloud(axes: Axes, cloud: _Cloud, colour: str, shown: Tensor) -> None:
     axes.grid(False)
 
 
-def _legend() -> list[Artist]:
-    """Return the entries of the legend."""
+def _legend(colour: str) -> list[Artist]:
+    """Return the entries of the legend, with the posterior in `colour`."""
     samples = (
-        Line2D([], [], color=colour, label=label, linestyle="", marker=".", markersize=4)
-        for colour, label in ((BLACK, "samples of the density"), (BLUE, "samples of the posterior"))
+        Line2D([], [], color=its_colour, label=label, linestyle="", marker=".", markersize=4)
+        for its_colour, label in ((BLACK, "samples of the density"), (colour, "samples of the posterior"))
     )
-    return [Patch(color=ORANGE, label="prior, density"), Patch(color=BLUE, label="posterior, density"), *samples]
+    return [Patch(color=GREY, label="prior, density"), Patch(color=colour, label="posterior, density"), *samples]
 
 
 def _draw_frame(axes: Axes, observation: Tensor, title: str) -> None:

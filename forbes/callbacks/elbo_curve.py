@@ -7,10 +7,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.callbacks.picture import PictureCallback
+from forbes.callbacks.picture import PictureCallback, colour_of
 from forbes.data import SequenceDataModule
 from forbes.evaluation.references import reference_means
-from forbes.figures.style import BLACK, BLUE, GREY, PAGE, draw_references, paper_style, show_settled
+from forbes.figures.style import BLACK, GREY, PAGE, draw_references, paper_style, show_settled
 from forbes.runs.folder import read_metrics
 from forbes.training.world_model import WorldModel
 
@@ -41,16 +41,16 @@ class ElboCurve(PictureCallback):
         """Draw the curves."""
         metrics = read_metrics(str(trainer.log_dir))
         names = [module.objective_name, *module.model.logged_terms]
-        has_kl = "kl" in names
+        has_kl, colour = "kl" in names, colour_of(module.model)
         with paper_style():
             figure = Figure((PAGE, 4.2 if has_kl else 2.3), layout="constrained")
             axes = figure.subplots(2 if has_kl else 1, 2).flat
             for panel, name in zip(axes, names, strict=False):
-                _draw_curves(panel, metrics, name)
+                _draw_curves(panel, metrics, name, colour)
                 unit = "step" if name == "overshoot" else "sequence"
                 panel.set(title=_TITLES.get(name, name), xlabel="updates", ylabel=f"nats per {unit}")
             if has_kl:
-                _draw_steps(axes[3], *self._kl_per_step(module, data))
+                _draw_steps(axes[3], *self._kl_per_step(module, data), colour)
             draw_references(axes[0], self._references(module, data))
             axes[0].legend()
         return figure
@@ -71,19 +71,19 @@ class ElboCurve(PictureCallback):
         return kl.nanmean(0), spread / count.sqrt()  # (T,), (T,)
 
 
-def _draw_curves(axes: Axes, metrics: pd.DataFrame, name: str) -> None:
+def _draw_curves(axes: Axes, metrics: pd.DataFrame, name: str, colour: str) -> None:
     """Draw one metric for both splits."""
     curves = []
-    for split, label, colour in [("train", "train", GREY), ("val", "validation", BLUE)]:
+    for split, label, of_split in [("train", "train", GREY), ("val", "validation", colour)]:
         if f"{split}/{name}" in metrics:
             curves.append(metrics[f"{split}/{name}"].dropna())
-            axes.plot(curves[-1].index, curves[-1], color=colour, label=label)
+            axes.plot(curves[-1].index, curves[-1], color=of_split, label=label)
     show_settled(axes, curves)
 
 
-def _draw_steps(axes: Axes, mean: Tensor, error: Tensor) -> None:
+def _draw_steps(axes: Axes, mean: Tensor, error: Tensor, colour: str) -> None:
     time = range(1, len(mean) + 1)
-    axes.fill_between(time, (mean - error).numpy(), (mean + error).numpy(), color=BLUE, alpha=0.25, linewidth=0)
-    axes.plot(time, mean.numpy(), color=BLUE)
+    axes.fill_between(time, (mean - error).numpy(), (mean + error).numpy(), color=colour, alpha=0.25, linewidth=0)
+    axes.plot(time, mean.numpy(), color=colour)
     axes.axhline(0, color=BLACK, linewidth=0.5)
     axes.set(title="KL at each step, validation", xlabel="t", ylabel="nats")

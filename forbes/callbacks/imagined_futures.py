@@ -3,7 +3,7 @@
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.callbacks.picture import PictureCallback, require_context, require_frames, shown_sequences
+from forbes.callbacks.picture import PictureCallback, colour_of, require_context, require_frames, shown_sequences
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import complete
@@ -49,4 +49,4 @@ class ImaginedFutures(PictureCallback):
         truth = data.source.pictures(module.model.likelihood.picture(batch.observation))[0]  # (last, C, H, W)
         completions = complete(module.model, data.source, batch, self.context, self.samples)
         futures = completions.frames[:, 0]  # (N, last - context, C, H, W)
-        return imagination.draw_futures(truth, futures, self.context, self.columns)
+        return imagination.draw_futures(truth, futures, self.context, self.columns, colour_of(module.model))

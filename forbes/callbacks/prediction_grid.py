@@ -3,12 +3,11 @@
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.callbacks.picture import PictureCallback, require_context, require_frames
+from forbes.callbacks.picture import PictureCallback, colour_of, require_context, require_frames
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
-from forbes.figures.style import BLUE
 from forbes.models import BeliefModel
 from forbes.training.world_model import WorldModel
 
@@ -61,6 +60,9 @@ def prediction_grid(
     """
     times = sorted({data.length, batch.observation.shape[1]})
     completions = complete(model, data.source, batch, context, samples)
-    sampled = [Panel(f"sampled completions, t = {time}", completions.at(time).transpose(0, 1), BLUE) for time in times]
+    colour = colour_of(model)
+    sampled = [
+        Panel(f"sampled completions, t = {time}", completions.at(time).transpose(0, 1), colour) for time in times
+    ]
     pictures = data.source.pictures(batch.observation)
     return draw_panels([truth_panel(pictures, times[::-1]), seen_panel(pictures, context), *sampled])

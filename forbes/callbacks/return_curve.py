@@ -8,7 +8,8 @@ from forbes.callbacks.collect import require_agent
 from forbes.callbacks.picture import PictureCallback
 from forbes.data import Experience, SequenceDataModule
 from forbes.data.datamodule import datamodule_of
-from forbes.figures.returns import published_curves, return_curve
+from forbes.evaluation.published import published_curves
+from forbes.figures.returns import return_curve
 from forbes.runs.folder import read_metrics
 from forbes.training.world_model import WorldModel
 

@@ -50,7 +50,9 @@ COMMANDS = {
     ),
     "complete": Command("draw completions of digits", "RUN -o picture.png", "forbes.commands.complete:main"),
     "export": Command("export a model to share", "RUN -o shared/model", "forbes.commands.export:main"),
-    "figures": Command("draw the paper's figures", "strokes --runs RUN RUN -o figures", "forbes.commands.figures:main"),
+    "figures": Command(
+        "draw the paper's figures", "predictions --runs RUN RUN -o figures", "forbes.commands.figures:main"
+    ),
     "data": Command(
         "fetch, build, collect and show data", "show strokes -o strokes.png", "forbes.commands.parsers.data:main"
     ),

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from forbes.commands.console import console
-from forbes.evaluation.agents import DISTANCES, REWARD, PlayedAgent
+from forbes.evaluation.agents import DISTANCES, REWARD, PlayedAgent, summarise_agents
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.metrics import EvaluatedRun, Pair, at_horizons, degradation
 from forbes.evaluation.references import lowest_above
@@ -188,6 +188,9 @@ def print_agents(played: Sequence[PlayedAgent]) -> None:
     for first, second in itertools.combinations(played, 2):
         difference = Estimate.of(first.returns - second.returns)
         screen.print(f"{escape(first.run)} minus {escape(second.run)}, paired: {difference}")
+    if summary := summarise_agents(played):
+        screen.print("interquartile mean over seeds of these mean returns, with 95 % bootstrap intervals of the seeds")
+        screen.print(*map(escape, summary.lines()), sep="\n", highlight=False)
 
 
 def _reward_prediction(played: Sequence[PlayedAgent]) -> Table:

@@ -1,7 +1,7 @@
 """Evaluate agents: their returns in whole episodes without exploration, the same episodes for every agent."""
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,9 @@ from forbes.envs.known_process import KnownProcess
 from forbes.errors import ForbesError
 from forbes.evaluation.agent_beliefs import exact_variance, learned_variance, prior_and_posterior, uncertainty
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
+from forbes.evaluation.methods import group_by_method, read_run
 from forbes.evaluation.record import require_readable, write_record
+from forbes.evaluation.returns import Summary, summarise
 from forbes.evaluation.reward_prediction import SAMPLES, predict_rewards, r2_by_steps_ahead
 from forbes.pomdps import Process
 from forbes.runs.provenance import origin
@@ -24,7 +26,7 @@ from forbes.seeding import derive_seed
 from forbes.training.acting import WorldModelAgent, play_measured
 from forbes.training.loading import load_run, loaded_agent
 
-__all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", "play_test_episode"]
+__all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", "play_test_episode", "summarise_agents"]
 
 DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
 REWARD = "reward_uncertainty"
@@ -101,6 +103,15 @@ def evaluate_agents(
             played.append(_play(run, agent, environment, checkpoint, episodes, seed))
         _record(played[-1], folder, seed, command)
     return played
+
+
+def summarise_agents(played: Sequence[PlayedAgent]) -> Summary | None:
+    """Summarise the mean return of each run over the seeds of each method; None unless there are seeds and methods."""
+    means = {one.run: one.returns.mean().item() for one in played}
+    ((task, methods),) = group_by_method([read_run(run) for run in means]).items()
+    if len(methods) == len(played):
+        return None
+    return summarise({title: {task: [means[run.path] for run in runs]} for title, runs in methods.items()})
 
 
 def _play(

@@ -16,8 +16,8 @@ from forbes.errors import ForbesError
 from forbes.models import BeliefModel, StateSpaceModel
 from forbes.training.loading import open_run
 
-__all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "require_comparable", "run_titles"]
-__all__ += ["split_batches"]
+__all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "method_name", "model_name"]
+__all__ += ["require_comparable", "run_titles", "split_batches"]
 
 _PUBLISHED: dict[type[nn.Module], str] = {GaussianBelief: "RSSM", FlowBelief: "FORBES"}
 """Published names of the models whose name differs from their class."""
@@ -41,8 +41,7 @@ class TrainedRun(NamedTuple):
 
         A suffix of the experiment's name is appended: RSSM wide for `rssm_wide`.
         """
-        kind = _kind(self.model)
-        name = _PUBLISHED.get(kind, kind.__name__.removesuffix("Belief").removesuffix("Model"))
+        name = model_name(self.model)
         for part in reversed(Path(self.path).resolve().parts):
             if match := re.fullmatch(rf"{name}((?:_[a-z]+)+)(?:-\d+)?", part, re.IGNORECASE):
                 return name + match[1].replace("_", " ")
@@ -52,6 +51,16 @@ class TrainedRun(NamedTuple):
     def parameters(self) -> int:
         """Number of parameters."""
         return sum(parameter.numel() for parameter in self.model.parameters())
+
+
+def method_name(kind: type[nn.Module]) -> str:
+    """Return the published name of a belief family or a model, or that of its class: Mixture for a `MixtureBelief`."""
+    return _PUBLISHED.get(kind, kind.__name__.removesuffix("Belief").removesuffix("Model"))
+
+
+def model_name(model: BeliefModel) -> str:
+    """Return the name of a model's family, e.g. FORBES."""
+    return method_name(_kind(model))
 
 
 def run_titles(runs: Sequence[TrainedRun]) -> list[str]:

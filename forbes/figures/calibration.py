@@ -12,11 +12,17 @@ from torch import Tensor
 
 from forbes.errors import ForbesError
 from forbes.evaluation.calibration.ranks import coverage
+from forbes.evaluation.calibration.runs import calibrate_run
 from forbes.evaluation.calibration.uniformity import binomial_interval, ecdf_band
-from forbes.figures.style import BLACK, GREY, PAGE, paper_style
+from forbes.evaluation.runs import load_runs
+from forbes.figures.families import group, require_same_data
+from forbes.figures.style import BLACK, GREY, PAGE, Method, paper_style
 from forbes.seeding import generator
 
-__all__ = ["RankedBelief", "calibration"]
+__all__ = ["RankedBelief", "calibration", "draw_calibration"]
+
+_SEQUENCES, _SAMPLES, _TIME = 1000, 99, 15
+"""Defaults of `forbes calibrate`: sequences and samples, and the step that is checked."""
 
 _CONFIDENCE = 0.95
 _BINS = 20
@@ -27,11 +33,31 @@ class RankedBelief(NamedTuple):
     """A belief with the ranks of N true values among L of its samples (`forbes.evaluation.calibration.ranks.ranks`)."""
 
     name: str
-    colour: str
+    style: Method
     value_ranks: Tensor
     """Ranks of the values, `(N, D)`, drawn as one line per dimension."""
     density_ranks: Tensor
     """Ranks of their log-densities, `(N,)`."""
+
+
+def draw_calibration(runs: Sequence[str]) -> dict[str, Figure]:
+    """Draw `calibration` of trained models against themselves, as `forbes calibrate` does, one line per run.
+
+    Of data with fewer than 1000 sequences or 15 steps, all are used.
+
+    Raises:
+        ForbesError: if a model has no state that could be ranked, or the runs are of different data.
+    """
+    trained = load_runs(runs)
+    require_same_data(trained)
+    data = trained[0].data
+    sequences, time = min(_SEQUENCES, data.source.size("train")), min(_TIME, data.length)
+    beliefs = []
+    for family in group(trained):
+        for run in family.runs:
+            found = calibrate_run(run, sequences, time, _SAMPLES)
+            beliefs.append(RankedBelief(family.label, family.style, found.value, found.density))
+    return {"calibration": calibration(beliefs, _SAMPLES)}
 
 
 def calibration(beliefs: Sequence[RankedBelief], samples: int) -> Figure:
@@ -57,9 +83,10 @@ def calibration(beliefs: Sequence[RankedBelief], samples: int) -> Figure:
         _draw_histogram(histogram, beliefs, count, samples)
         _draw_difference(difference, beliefs, count, samples)
         _draw_coverage(covered, beliefs, count, samples)
-        lines = [Line2D([], [], color=belief.colour, label=belief.name) for belief in beliefs]
+        styles = {belief.name: belief.style for belief in beliefs}  # several runs may have one name
+        lines = [Line2D([], [], color=style.colour, ls=style.line, label=name) for name, style in styles.items()]
         band = Patch(color=GREY, alpha=0.3, lw=0, label="calibrated, 95 %")
-        figure.legend(handles=[*lines, band], loc="outside upper center", ncols=len(beliefs) + 1)
+        figure.legend(handles=[*lines, band], loc="outside upper center", ncols=len(lines) + 1)
     return figure
 
 
@@ -75,7 +102,7 @@ def _draw_histogram(axes: Axes, beliefs: Sequence[RankedBelief], count: int, sam
     for belief in beliefs:
         for ranks in belief.value_ranks.T:
             density = bin_of[ranks].bincount(minlength=bins) / count / width  # (bins,)
-            axes.stairs(density.tolist(), edges, color=belief.colour, alpha=_alpha(belief), baseline=None)
+            axes.stairs(density.tolist(), edges, color=belief.style.colour, alpha=_alpha(belief), baseline=None)
     axes.set(xlabel="rank of the true value / L", ylabel="density of ranks", xlim=(0, 1))
     axes.set_ylim(bottom=0)
 
@@ -90,7 +117,7 @@ def _draw_difference(axes: Axes, beliefs: Sequence[RankedBelief], count: int, sa
     for belief in beliefs:
         for ranks in belief.value_ranks.T:
             below = torch.nn.functional.pad(ranks.bincount(minlength=samples + 1).double().cumsum(0), (1, 0)) / count
-            axes.plot(uniform, below - uniform, color=belief.colour, alpha=_alpha(belief))
+            axes.plot(uniform, below - uniform, color=belief.style.colour, ls=belief.style.line, alpha=_alpha(belief))
     axes.set(xlabel="rank of the true value / L", ylabel="ECDF − uniform", xlim=(0, 1))
 
 
@@ -101,7 +128,8 @@ def _draw_coverage(axes: Axes, beliefs: Sequence[RankedBelief], count: int, samp
     axes.fill_between(levels, low, high, color=GREY, alpha=0.3, lw=0)
     axes.plot([0, 1], [0, 1], color=BLACK, lw=0.6)
     for belief in beliefs:
-        axes.plot(levels, coverage(belief.density_ranks, samples, levels), color=belief.colour)
+        inside = coverage(belief.density_ranks, samples, levels)
+        axes.plot(levels, inside, color=belief.style.colour, ls=belief.style.line)
     axes.set(xlabel="nominal level of the region", ylabel="true values inside", xlim=(0, 1), ylim=(0, 1))
     axes.set_aspect("equal")
 

@@ -1,8 +1,7 @@
 """Compare families in three figures: scores, scores per step, and differences by score."""
 
 import math
-from collections.abc import Sequence
-from itertools import cycle
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -11,7 +10,7 @@ from matplotlib.figure import Figure
 
 from forbes.evaluation.comparison import Comparison
 from forbes.evaluation.metrics import SCORES, score_of
-from forbes.figures.style import COLUMN, GREY, PAGE, PALETTE, draw_references, paper_style
+from forbes.figures.style import COLUMN, GREY, PAGE, Method, draw_references, method_styles, method_title, paper_style
 
 __all__ = ["draw_differences", "draw_per_step", "draw_scores"]
 
@@ -47,7 +46,7 @@ def draw_scores(comparison: Comparison) -> Figure:
             axes.locator_params(axis="x", nbins=4)  # more labels would touch
         for axes in panels[len(metrics) :]:
             axes.remove()
-        panels[0].set_yticks(range(len(families)), families)
+        panels[0].set_yticks(range(len(families)), [method_title(name) for name in families])
         panels[0].set_ylim(len(families) - 0.5, -0.5)
         dashed = "" if np.isnan(known) else ", dashed: the exact log p, which no bound exceeds"
         names = list(next(iter(comparison.references.values()), {}))
@@ -58,17 +57,24 @@ def draw_scores(comparison: Comparison) -> Figure:
 
 def _draw_score(axes: Axes, of_metric: pd.DataFrame, families: Sequence[str]) -> None:
     near = _near(of_metric.groupby("family", sort=False)["mean"].mean().dropna())
-    for y, (name, colour) in enumerate(zip(families, cycle(PALETTE), strict=False)):
+    for y, (name, style) in enumerate(method_styles(families).items()):
         seeds = of_metric[of_metric["family"] == name]
         mean = seeds["mean"].mean()
         if name in near:
             heights = y + 0.3 * (np.arange(1, len(seeds) + 1) / (len(seeds) + 1) - 0.5)
-            axes.errorbar(seeds["mean"], heights, xerr=seeds["standard_error"], fmt=".", color=colour, elinewidth=0.8)
-            axes.plot([mean] * 2, [y - 0.35, y + 0.35], color=colour)
+            widths, colour = seeds["standard_error"], style.colour
+            axes.errorbar(seeds["mean"], heights, xerr=widths, fmt=style.marker, ms=3, color=colour, elinewidth=0.8)
+            axes.plot([mean] * 2, [y - 0.35, y + 0.35], color=style.colour)
         elif not np.isnan(mean):
             at_edge = axes.get_yaxis_transform()
             axes.text(
-                0.02, y, f"← {mean:.1f}".replace("-", "−"), transform=at_edge, va="center", color=colour, fontsize=7
+                0.02,
+                y,
+                f"← {mean:.1f}".replace("-", "−"),
+                transform=at_edge,
+                va="center",
+                color=style.colour,
+                fontsize=7,
             )
 
 
@@ -87,28 +93,29 @@ def draw_per_step(comparison: Comparison) -> Figure | None:
         return None
     columns = min(3, len(metrics))
     rows = math.ceil(len(metrics) / columns)
-    colours = dict(zip(comparison.scores["family"].unique(), cycle(PALETTE), strict=False))
+    styles = method_styles(list(comparison.scores["family"].unique()))
     with paper_style():
         figure = Figure((PAGE if columns > 1 else COLUMN, 2.4 * rows + 0.2), layout="constrained")
         panels = figure.subplots(rows, columns, squeeze=False).flat
         for axes, metric in zip(panels, metrics, strict=False):
-            _draw_steps(axes, comparison.curves[metric], metric, colours)
+            _draw_steps(axes, comparison.curves[metric], metric, styles)
         for axes in panels[len(metrics) :]:
             axes.remove()
         lines = {line.get_label(): line for axes in figure.axes for line in axes.lines}  # not all panels have all
-        named = {name: lines[name] for name in colours if name in lines}
+        named = {title: lines[title] for title in map(method_title, styles) if title in lines}
         figure.legend(named.values(), named.keys(), loc="outside upper center", ncols=4 if columns > 1 else 2)
     return figure
 
 
-def _draw_steps(axes: Axes, curves: dict[str, list[float]], metric: str, colours: dict[str, str]) -> None:
+def _draw_steps(axes: Axes, curves: dict[str, list[float]], metric: str, styles: Mapping[str, Method]) -> None:
     for name, curve in curves.items():
         steps = np.arange(1, len(curve) + 1)
         shown = np.cumsum(np.abs(curve)) > 0  # the open-loop score begins after its context
-        axes.plot(steps[shown], np.asarray(curve)[shown], color=colours[name], label=name)
+        style = styles[name]
+        axes.plot(steps[shown], np.asarray(curve)[shown], color=style.colour, ls=style.line, label=method_title(name))
     axes.set_title(_in_lines(metric))
     axes.set_xlabel("step")
-    axes.set_ylabel("fraction of K" if score_of(metric) == "ess" else "nats")
+    axes.set_ylabel("fraction of K" if score_of(metric) == "ess" else "nats per step")
 
 
 def draw_differences(comparison: Comparison, first: str) -> Figure:
@@ -126,8 +133,8 @@ def draw_differences(comparison: Comparison, first: str) -> Figure:
         for (row, column), value in np.ndenumerate(values):
             axes.text(column, row, "n/a" if np.isnan(value) else f"{value:+.2f}", ha="center", va="center")
         axes.set_xticks(range(len(table.columns)), [_in_lines(metric) for metric in table.columns])
-        axes.set_yticks(range(len(table)), table.index)
-        axes.set_title(f"difference to {first} in nats per sequence, paired, mean over seeds")
+        axes.set_yticks(range(len(table)), [method_title(name) for name in table.index])
+        axes.set_title(f"difference to {method_title(first)} in nats per sequence, paired, mean over seeds")
         axes.grid(visible=False)
     return figure
 

@@ -1,7 +1,7 @@
 """Figures of digit completions: drawings with their classes, scores, and the error of the best of n."""
 
 from collections.abc import Sequence
-from itertools import chain, cycle
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from forbes.evaluation.digits.study import Row, Study
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.predictions import complete
 from forbes.figures.grids import Bars, Panel, draw_bands
-from forbes.figures.style import BLACK, GREY, PAGE, PALETTE, paper_style
+from forbes.figures.style import BLACK, GREY, PAGE, Method, method_styles, paper_style
 from forbes.models import BeliefModel
 from forbes.seeding import derive_seed, forked
 
@@ -78,13 +78,13 @@ def draw_completions(
         Bars("reference", reference, GREY, notes=ambiguity),
     ]
     of_models: list[list[Panel | Bars]] = []
-    for row, model, colour in zip(study.runs, models, cycle(PALETTE), strict=False):
+    for row, model, style in zip(study.runs, models, _styles(study), strict=True):
         with forked("cpu", derive_seed(seed, "drawings", context)):
             completions = complete(model, source, batch, context, _SHOWN)
         frames = completions.frames[:, digit, end - context - 1]  # (S, R, 1, H, W)
         notes = [f"JS = {value:.2f}" for value in row.scores["js[end]"][place].tolist()]
-        classes = Bars("their classes", row.classes[place].numpy(), colour, reference, notes)
-        of_models.append([Panel(row.name, frames.transpose(0, 1), colour), classes])
+        classes = Bars("their classes", row.classes[place].numpy(), style.colour, reference, notes)
+        of_models.append([Panel(row.name, frames.transpose(0, 1), style.colour), classes])
     pairs = [of_models[first : first + _SIDE_BY_SIDE] for first in range(0, len(of_models), _SIDE_BY_SIDE)]
     return draw_bands([[*prefix_panels, *chain(*pair)] for pair in pairs])
 
@@ -96,11 +96,11 @@ def draw_class_scores(studies: Sequence[Study]) -> Figure:
         panels = figure.subplots(1, len(_SCORES))
         labelled: dict[str, Any] = {}
         for axes, (score, (title, beside)) in zip(panels, _SCORES.items(), strict=True):
-            for number, colour in zip(range(len(studies[0].runs)), cycle(PALETTE), strict=False):
-                _draw_line(axes, studies, [one.runs[number] for one in studies], score, colour, "-")
+            for number, style in enumerate(_styles(studies[0])):
+                _draw_line(axes, studies, [one.runs[number] for one in studies], score, style)
             for name in beside:
                 rows = [getattr(one, name) for one in studies]
-                _draw_line(axes, studies, rows, score, GREY, _LINES[name])
+                _draw_line(axes, studies, rows, score, Method(GREY, _LINES[name], "."))
             axes.set(title=title, xlabel="steps seen", xticks=[one.prefixes.context for one in studies])
             axes.set_ylim(bottom=0)
             labelled |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
@@ -109,11 +109,28 @@ def draw_class_scores(studies: Sequence[Study]) -> Figure:
     return figure
 
 
-def _draw_line(axes: Axes, studies: Sequence[Study], rows: Sequence[Row], score: str, colour: str, line: str) -> None:
+def _styles(study: Study) -> list[Method]:
+    """Return the style of each run."""
+    names = [row.name for row in study.runs]
+    styles = method_styles(names)
+    return [styles[name] for name in names]
+
+
+def _draw_line(axes: Axes, studies: Sequence[Study], rows: Sequence[Row], score: str, style: Method) -> None:
     found = [Estimate.of(row.scores[score]) for row in rows]
     steps = [study.prefixes.context for study in studies]
     means, widths = ([getattr(one, name) for one in found] for name in ("mean", "standard_error"))
-    axes.errorbar(steps, means, widths, fmt=f".{line}", color=colour, label=rows[0].name, capsize=2, markersize=3)
+    axes.errorbar(
+        steps,
+        means,
+        widths,
+        color=style.colour,
+        ls=style.line,
+        marker=style.marker,
+        label=rows[0].name,
+        capsize=2,
+        markersize=3,
+    )
 
 
 def draw_errors(studies: Sequence[Study]) -> Figure:
@@ -122,11 +139,12 @@ def draw_errors(studies: Sequence[Study]) -> Figure:
         figure = Figure((PAGE, 2.3), layout="constrained")
         panels = figure.subplots(1, len(studies), squeeze=False, sharey=True)[0]
         for axes, study in zip(panels, studies, strict=True):
-            rows = [*zip(study.runs, cycle(PALETTE), strict=False), (study.similar, GREY)]
-            for row, colour in rows:
+            rows = [*zip(study.runs, _styles(study), strict=True), (study.similar, Method(GREY))]
+            for row, style in rows:
                 number = np.arange(1, len(row.best) + 1)
-                axes.plot(number, row.best, color=colour, label=row.name)
-                axes.plot(number, row.average, "--", color=colour)
+                marks = {"marker": style.marker, "markevery": (0.05, 0.2), "markersize": 3}  # dashes are averages
+                axes.plot(number, row.best, color=style.colour, label=row.name, **marks)
+                axes.plot(number, row.average, "--", color=style.colour, **marks)
             axes.set(title=f"{study.prefixes.context} steps seen", xlabel="completions, n", xscale="log")
             axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axes.set_ylim(bottom=0)

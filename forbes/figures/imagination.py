@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forbes.figures.grids import Panel, draw_bands, seen_steps
-from forbes.figures.style import BLACK, BLUE, GREY
+from forbes.figures.style import BLACK, GREY
 
 __all__ = ["draw_futures", "draw_open_loop"]
 
@@ -44,7 +44,7 @@ def draw_open_loop(truth: Tensor, model: Tensor, mask: Tensor, context: int, col
     return draw_bands(bands)
 
 
-def draw_futures(truth: Tensor, futures: Tensor, context: int, columns: int) -> Figure:
+def draw_futures(truth: Tensor, futures: Tensor, context: int, columns: int, colour: str) -> Figure:
     """Draw a sequence and, below it, N futures imagined from one belief, with the same past.
 
     Args:
@@ -52,6 +52,7 @@ def draw_futures(truth: Tensor, futures: Tensor, context: int, columns: int) -> 
         futures: imagined steps context + 1 … T, `(N, T - context, C, H, W)`.
         context: number of frames that the model sees.
         columns: number of frames shown per future, evenly spaced to the last.
+        colour: ink of the futures, if the frames are grey.
     """
     seen = seen_steps(context)
     later = _later(context, len(truth), columns)
@@ -62,7 +63,7 @@ def draw_futures(truth: Tensor, futures: Tensor, context: int, columns: int) -> 
     names = [f"future {number + 1}" for number in range(len(futures))]
     above = [Panel("seen", past, BLACK, (), ["truth"]), Panel(title, true_rest, BLACK)]
     pasts = past.expand(len(futures), -1, -1, -1, -1)  # (N, S, C, H, W)
-    below = [Panel("", pasts, GREY, _labels(seen), names), Panel("", chosen, BLUE, _labels(later))]
+    below = [Panel("", pasts, GREY, _labels(seen), names), Panel("", chosen, colour, _labels(later))]
     return draw_bands([above, below])
 
 

@@ -1,20 +1,15 @@
-"""Plot the returns of agents against env steps, with published curves for comparison."""
+"""Plot the returns of one agent during its training, with published curves for comparison."""
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
-from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from forbes.data.download import curves_path
-from forbes.errors import ForbesError
-from forbes.figures.style import COLUMN, GREY, ORANGE, PALETTE, draw_range, paper_style
-from forbes.reading import read_json, readable
+from forbes.figures.style import BLACK, COLUMN, GREY, draw_range, method_styles, method_title, paper_style
 
-__all__ = ["published_curves", "return_curve", "returns_against_env_steps"]
+__all__ = ["join_seeds", "return_curve"]
 
 
 def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Sequence[pd.Series]]) -> Figure:
@@ -30,39 +25,19 @@ def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Seque
     with paper_style():
         figure = Figure((COLUMN, 2.3), layout="constrained")
         axes = figure.subplots()
-        for (method, curves), colour in zip(published.items(), cycle((ORANGE, *PALETTE[2:])), strict=False):
-            draw_range(axes, _joined(curves), colour, f"{method}, published, {len(curves)} seeds")
+        for method, style in method_styles([*published]).items():
+            curves = published[method]
+            label = f"{method_title(method)}, published, {len(curves)} seeds"
+            draw_range(axes, join_seeds(curves), style, label)
         marker = "." if len(exploring) == 1 else ""
         axes.plot(exploring.index, exploring, color=GREY, lw=0.6, label="exploring", marker=marker)
-        axes.plot(acting.index, acting, ".-", color=PALETTE[0], markersize=3, label="acting, without exploration")
+        axes.plot(acting.index, acting, ".-", color=BLACK, markersize=3, label="acting, without exploration")
         _label(axes, task, table.index.max())
     return figure
 
 
-def returns_against_env_steps(task: str, agents: Mapping[str, Sequence[pd.Series]]) -> Figure:
-    """Draw the returns of agents without exploration: mean and range over seeds, at the steps that all seeds reached.
-
-    Args:
-        task: name of the task, used as title.
-        agents: curves of returns against env steps by agent, one per seed.
-
-    Raises:
-        ForbesError: if the curves of an agent have no step in common.
-    """
-    with paper_style():
-        figure = Figure((COLUMN, 2.6), layout="constrained")
-        axes = figure.subplots()
-        for (name, curves), colour in zip(agents.items(), cycle(PALETTE), strict=False):
-            label = name if len(curves) == 1 else f"{name}, {len(curves)} seeds"
-            if (joined := _joined(curves)).empty:
-                raise ForbesError(f"{name}: no step was reached by all its {len(curves)} seeds. Train them further")
-            draw_range(axes, joined, colour, label)
-        _label(axes, task, max(curve.index.max() for curves in agents.values() for curve in curves))
-    return figure
-
-
-def _joined(curves: Sequence[pd.Series]) -> pd.DataFrame:
-    """Interpolate the curves of all seeds to common steps."""
+def join_seeds(curves: Sequence[pd.Series]) -> pd.DataFrame:
+    """Interpolate the curves of all seeds to common steps, one column each."""
     return pd.concat(curves, axis=1).sort_index().interpolate("index", limit_area="inside").dropna()
 
 
@@ -72,36 +47,3 @@ def _label(axes: Axes, task: str, end: float) -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
     axes.locator_params("x", nbins=6)
     axes.legend(loc="best")
-
-
-def published_curves(path: str | None, task: str) -> dict[str, list[pd.Series]]:
-    """Read the published curves of a task: returns against env steps by method, one per seed.
-
-    Args:
-        path: file with a JSON list of `{"task": …, "method": …, "seed": …, "xs": [env steps], "ys": [returns]}`, as
-            published by the authors of Dreamer; their task names may begin with `dmc_`. None for the file of
-            `forbes data fetch curves`, which gives no curves if it is missing or lacks the task.
-        task: name of the task, e.g. `cartpole_swingup`.
-
-    Raises:
-        ForbesError: if the file is invalid, or a file given by `path` lacks the task.
-    """
-    if path is None and not curves_path().is_file():
-        return {}
-    names = {task, f"dmc_{task}", f"dmc_{task.removeprefix('ball_in_')}"}  # Dreamer calls ball_in_cup_catch cup_catch
-    curves: dict[str, list[pd.Series]] = {}
-    known = set()
-    file, remedy = Path(path or curves_path()), "Name another, or none"
-    if not file.is_file():
-        raise ForbesError(f"{file}: no such file. {remedy}")
-    found = read_json(file, remedy)
-    with readable(file, "a file of curves, expected a JSON list of task, method, seed, xs and ys", remedy):
-        for one in found:
-            known.add(one["task"])
-            if one["task"] in names:
-                curve = pd.Series(one["ys"], index=one["xs"], dtype=float)
-                curves.setdefault(one["method"], []).append(curve)
-    if path and not curves:
-        listed = ", ".join(sorted(known)) or "nothing"
-        raise ForbesError(f"{path}: has no curve for {task}, only for {listed}. Name another file, or none")
-    return curves

@@ -1,10 +1,12 @@
 """The common style of all figures: sizes for a two-column paper, few colours, no pyplot state."""
 
 import io
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import cycle
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
 import pandas as pd
@@ -15,17 +17,46 @@ from matplotlib.figure import Figure
 from forbes.errors import ForbesError
 from forbes.files import replace_file
 
-__all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "ORANGE", "PAGE", "PALETTE", "density_map", "draw_range"]
-__all__ += ["draw_references", "paper_style", "save_figure", "save_png_and_pdf", "show_settled"]
+__all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "METHODS", "ORANGE", "PAGE", "PALETTE", "Method"]
+__all__ += ["density_map", "draw_range", "draw_references", "method_styles", "method_title", "paper_style"]
+__all__ += ["save_figure", "save_png_and_pdf", "show_settled"]
 
 COLUMN, PAGE = 3.3, 6.9
 """Widths in inches: one column and the whole page."""
 
 BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#007a5a"
-"""Colours that differ in hue and brightness, for colour-blind readers and print (after Okabe and Ito)."""
 BLACK, GREY = "#1a1a1a", "#808080"
+
+
+class Method(NamedTuple):
+    """How a method is drawn in every figure. Line and marker differ too, for colour-blind readers and grey print."""
+
+    colour: str
+    line: Any = "-"
+    """Line style: a name, or an offset with the lengths of dashes and gaps in multiples of the line's width."""
+    marker: str = "o"
+
+
+METHODS = {
+    "FORBES": Method(BLUE),
+    "RSSM": Method(ORANGE, (0, (5, 1.5)), "s"),
+    "RSSM wide": Method("#e69f00", (0, (5, 1.5, 1, 1.5)), "D"),
+    "Mixture": Method(GREEN, (0, (2, 1)), "^"),
+    "Categorical": Method("#cc79a7", (0, (5, 1.5, 1, 1.5, 1, 1.5)), "v"),
+    "Particle": Method("#56b4e9", (0, (8, 1.5)), "P"),
+    "Vector": Method("#7d4f1f", (0, (3, 3)), "X"),
+    "PlaNet": Method("#882255", (0, (1, 1)), "<"),
+    "Dreamer": Method(ORANGE, (0, (5, 1.5)), "s"),  # the agent on the RSSM, and drawn like it
+    "exact belief": Method(BLACK, "-", "*"),
+    "published": Method(GREY, ":", ""),
+}
+"""Spelling and style of each method. The colours differ in hue and brightness (after Okabe and Ito)."""
+
 PALETTE = (BLUE, ORANGE, GREEN, BLACK, "#cc79a7", "#56b4e9", "#e69f00", GREY)
-"""Colours of several models, in order."""
+"""Colours of things that are no methods, in order."""
+
+_SPARE = tuple(style for name, style in METHODS.items() if name not in ("Dreamer", "exact belief", "published"))
+"""Styles of unknown methods, in order."""
 
 _STYLE: dict[Any, Any] = {
     "axes.grid": True,
@@ -48,6 +79,55 @@ _STYLE: dict[Any, Any] = {
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
 }
+
+
+def method_title(name: str) -> str:
+    """Return the title of a method, spelled as in `METHODS`: `rssm_wide` is RSSM wide, and `forbes_deep` FORBES deep.
+
+    Args:
+        name: title, or name of a configuration or run folder. An unknown name is its own title.
+    """
+    if (method := _method(name)) is None:
+        return name
+    plain = _plain(name)
+    return (method + plain[_matched(method, plain) :]).strip()
+
+
+def method_styles(names: Sequence[str]) -> dict[str, Method]:
+    """Return the style of each method in a figure.
+
+    The first name of a method in `METHODS` has its style, e.g. `FORBES (deep)` that of FORBES. Further names of the
+    same method, and unknown ones, take the styles that no other name has, in order.
+
+    Args:
+        names: titles, or names of configurations or run folders, as in `method_title`.
+    """
+    styles: dict[str, Method] = {}
+    for name in names:
+        method = _method(name)
+        if method is not None and METHODS[method] not in styles.values():
+            styles[name] = METHODS[method]
+    spare = cycle([style for style in _SPARE if style not in styles.values()] or _SPARE)
+    return {name: styles.get(name) or next(spare) for name in names}
+
+
+def _method(name: str) -> str | None:
+    """Return the method that a name begins with, the longest if there are several."""
+    found = [method for method in METHODS if _matched(method, _plain(name))]
+    return max(found, key=len, default=None)
+
+
+def _matched(method: str, plain: str) -> int:
+    """Return how many characters of a plain name are the method's, 0 if it is another's."""
+    for spelling in (method, method.removesuffix(" belief")):  # the exact belief's agents are called exact
+        if re.match(rf"{spelling}(?![a-z])", plain, re.IGNORECASE):
+            return len(spelling)
+    return 0
+
+
+def _plain(name: str) -> str:
+    """Return a name with spaces, without the prefix of the configurations of agents."""
+    return name.replace("_", " ").removeprefix("agent ")
 
 
 @contextmanager
@@ -87,11 +167,12 @@ def density_map(colour: str) -> LinearSegmentedColormap:
     return LinearSegmentedColormap.from_list("density", ["white", colour])
 
 
-def draw_range(axes: Axes, runs: pd.DataFrame, colour: str, label: str) -> None:
+def draw_range(axes: Axes, runs: pd.DataFrame, method: Method, label: str) -> None:
     """Draw mean and range of several runs, one column each, against the index."""
-    axes.fill_between(runs.index, runs.min(axis=1), runs.max(axis=1), color=colour, alpha=0.2, lw=0)
-    marker = "o" if len(runs) == 1 else ""  # a line of one point would be invisible
-    axes.plot(runs.index, runs.mean(axis=1), color=colour, label=label, marker=marker, markersize=3)
+    axes.fill_between(runs.index, runs.min(axis=1), runs.max(axis=1), color=method.colour, alpha=0.2, lw=0)
+    marker = method.marker if len(runs) == 1 else ""  # a line of one point would be invisible
+    mean = runs.mean(axis=1)
+    axes.plot(mean.index, mean, color=method.colour, ls=method.line, label=label, marker=marker, markersize=3)
 
 
 def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", "y"] = "y") -> bool:

@@ -15,8 +15,10 @@ from small_agents import fit, write_image_config
 from forbes.callbacks import EpisodeVideo, ImaginedFutures, OpenLoopPanel, ReturnCurve
 from forbes.callbacks.picture import shown_sequences
 from forbes.evaluation.predictions import open_loop_frames
+from forbes.evaluation.published import published_curves
 from forbes.figures.imagination import draw_futures
-from forbes.figures.returns import published_curves, return_curve
+from forbes.figures.returns import return_curve
+from forbes.figures.style import BLUE
 from forbes.figures.video import gif
 from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder, read_metrics
@@ -157,7 +159,7 @@ def test_a_future_stands_at_its_own_step():
     """A frame whose grey is its time, counted from 1, out of 20."""
     time = torch.arange(1, 21).view(20, 1, 1, 1).expand(20, 3, 8, 8) / 20
 
-    figure = draw_futures(time, time[5:].expand(2, -1, -1, -1, -1), context=5, columns=4)
+    figure = draw_futures(time, time[5:].expand(2, -1, -1, -1, -1), context=5, columns=4, colour=BLUE)
 
     labels = [int(label.get_text()[2:]) for axes in figure.axes[2:] for label in axes.get_xticklabels()]
     assert labels == [2, 4, 5, 6, 11, 15, 20]
@@ -212,7 +214,7 @@ def test_published_curves_are_drawn_as_mean_and_range_of_seeds(tmp_path):
     figure = return_curve(metrics, "cup", published_curves(str(path), "ball_in_cup_catch"))
 
     band = figure.axes[0].lines[0]
-    assert band.get_label() == "dreamer, published, 2 seeds"
+    assert band.get_label() == "Dreamer, published, 2 seeds"
     assert band.get_xydata().tolist() == [[0, 2], [10, 3]]
     assert set(figure.axes[0].collections[0].get_paths()[0].vertices[:, 1]) == {0, 1, 4, 5}
     assert figure.axes[0].get_xlim()[1] == pytest.approx(1.02 * 15)

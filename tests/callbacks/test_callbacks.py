@@ -18,7 +18,7 @@ from forbes.callbacks import BeliefPlot, ElboCurve, PredictionGrid
 from forbes.callbacks.belief_plot import _kernel_density, _principal_plane
 from forbes.callbacks.parameter_count import count_parameters
 from forbes.commands.cli import main
-from forbes.figures.style import BLACK, BLUE, ORANGE
+from forbes.figures.style import BLACK, BLUE, GREY
 from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder, read_metrics
 from forbes.training.loading import load_run
@@ -219,7 +219,7 @@ def test_the_legend_of_beliefs_names_each_colour_that_is_drawn(tiny_run):
     }
     drawn = {to_hex(line.get_color()) for axes in figure.axes for line in axes.lines}
     assert drawn == {BLACK, BLUE}
-    assert names.keys() == {ORANGE, BLUE, BLACK}
+    assert names.keys() == {GREY, BLUE, BLACK}
     figure.canvas.draw()
     box = legend.get_window_extent()
     assert not [axes for axes in figure.axes if axes.get_tightbbox().overlaps(box)]

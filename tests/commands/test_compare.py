@@ -97,7 +97,7 @@ def test_the_pictures_are_there_and_show_the_values(compared, families):
     own = comparison.scores.groupby("family", sort=False)["mean"]
     bars = [line.get_xdata()[0] for line in panel.lines if len(line.get_xdata()) == 2 and line.get_marker() == "None"]
     assert bars == pytest.approx(own.mean().tolist())
-    assert [text.get_text() for text in panel.get_yticklabels()] == ["rssm", "forbes"]
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["RSSM", "FORBES"]
 
     (panel,) = draw_per_step(comparison).axes
     assert panel.lines[1].get_ydata() == pytest.approx(comparison.curves[ELBO]["forbes"])
@@ -141,10 +141,10 @@ def test_a_score_that_a_family_does_not_have_is_empty(configs, vector, compared,
     families = [Family(n, {0: str(folder / f"{n}-0")}, 9, lacks) for n, lacks in [("rssm", []), ("vector", [ELBO])]]
     comparison = compare(families, [ELBO, pll])
     elbo, of_pll = draw_per_step(comparison).axes
-    assert [line.get_label() for line in elbo.lines] == ["rssm"]
-    assert {line.get_label(): line.get_color() for line in of_pll.lines}["rssm"] == elbo.lines[0].get_color()
+    assert [line.get_label() for line in elbo.lines] == ["RSSM"]
+    assert {line.get_label(): line.get_color() for line in of_pll.lines}["RSSM"] == elbo.lines[0].get_color()
     legend = draw_per_step(comparison).legends[0]
-    assert [entry.get_text() for entry in legend.get_texts()] == ["rssm", "vector"]
+    assert [entry.get_text() for entry in legend.get_texts()] == ["RSSM", "Vector"]
 
 
 def test_an_outlier_is_labelled_and_the_exact_line_is_drawn():

@@ -127,3 +127,23 @@ def test_refuses_what_cannot_be_compared(run, tiny_run, tmp_path, capsys):
         assert f"{other}: 1/" not in err  # it says so before it plays
     assert not (other / "evaluation.json").exists()
     assert read_record(str(run))["return[episodes=10]"]  # and what was played before is kept
+
+
+def test_seeds_of_several_methods_are_summarised(tmp_path, capsys):
+    runs = [tmp_path / f"{kind}-{seed}" for kind in ("forbes", "dreamer") for seed in (0, 1)]
+    for run in runs:
+        kind, seed = run.name.split("-")
+        brief = ("--trainer.max_epochs", 1, "--seed_everything", seed)
+        assert fit("--config", write_config(tmp_path, kind), *brief, "--run_dir", run) == 0
+
+    assert forbes("evaluate", *runs, "--episodes", 2) == 0
+
+    means = [read_record(str(run))["return[episodes=2]"]["mean"] for run in runs]
+    wins = np.mean([(np.sign(one - other) + 1) / 2 for one in means[:2] for other in means[2:]])  # a tie is half
+    out = capsys.readouterr().out
+    assert "interquartile mean over seeds" in out
+    assert f"FORBES   {np.mean(means[:2]):.2f} [{min(means[:2]):.2f}, {max(means[:2]):.2f}], 2 runs" in out
+    assert f"P(FORBES > Dreamer) = {wins:.2f} [0." in out
+
+    assert forbes("evaluate", *runs[::2], "--episodes", 2) == 0
+    assert "interquartile mean" not in capsys.readouterr().out  # one seed each

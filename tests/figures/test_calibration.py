@@ -2,10 +2,12 @@
 
 import pytest
 import torch
+from command_line import error_of
 
+from forbes.commands.cli import main
 from forbes.errors import ForbesError
-from forbes.figures.calibration import RankedBelief, calibration
-from forbes.figures.style import BLUE, ORANGE, save_figure
+from forbes.figures.calibration import RankedBelief, calibration, draw_calibration
+from forbes.figures.style import BLUE, METHODS, ORANGE, Method, save_figure
 
 SAMPLES, COUNT = 39, 500
 
@@ -16,7 +18,7 @@ def belief(name, colour, width, seed=0, count=COUNT):
     truth, samples = (torch.randn(*shape, count, 2, generator=generator) for shape in ((), (SAMPLES,)))
     samples = width * samples
     density = (samples.square().sum(-1) < truth.square().sum(-1)).sum(0)  # (N,), how many are less dense is L - this
-    return RankedBelief(name, colour, (samples < truth).sum(0), SAMPLES - density)
+    return RankedBelief(name, Method(colour), (samples < truth).sum(0), SAMPLES - density)
 
 
 @pytest.fixture(scope="module")
@@ -101,3 +103,24 @@ def test_beliefs_about_other_states_are_not_compared():
 
     with pytest.raises(ForbesError, match=r"^short: 100 and 100 ranks, expected 500 as for exact\. Rank the same"):
         calibration(beliefs, SAMPLES)
+
+
+def test_runs_of_a_family_share_a_style_and_one_entry(tiny_run, tiny_config, tmp_path):
+    other = str(tmp_path / "forbes-1")
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", other, "--seed_everything", "1"]) == 0
+
+    figure = draw_calibration([str(tiny_run), other])["calibration"]
+
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["FORBES, 2 runs", "calibrated, 95 %"]
+    assert len(lines_of(figure.axes[2], METHODS["FORBES"].colour)) == 2
+
+
+def test_a_model_without_a_state_is_not_calibrated(tiny_config, tmp_path, capsys):
+    run = tmp_path / "vector-0"
+    vector = ["--model.model", "VectorModel", "--model.state_dim", "0"]
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run), *vector]) == 0
+
+    sentence = error_of(capsys, "figures", "calibration", "--runs", run, "-o", tmp_path / "figures")
+
+    assert sentence == f"{run}: a Vector model has no state that could be ranked. Name other runs"

@@ -12,6 +12,7 @@ from forbes.errors import ForbesError
 from forbes.figures.episodes import draw_strips, to_rgb
 from forbes.figures.grids import Panel, draw_panels, require_images
 from forbes.figures.imagination import draw_futures, draw_open_loop
+from forbes.figures.style import BLUE
 from forbes.figures.video import gif
 
 CHANNELS = pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -53,7 +54,7 @@ def test_imagination_is_drawn(channels):
     mask[1, 4] = False
 
     panels = draw_open_loop(truth, truth, mask, context=2, columns=4)
-    futures = draw_futures(truth[0], truth[:, 2:], context=2, columns=3)
+    futures = draw_futures(truth[0], truth[:, 2:], context=2, columns=3, colour=BLUE)
 
     after_the_end = np.asarray(panels.axes[3].images[0].get_array())[2 : 2 + HEIGHT, -2 - WIDTH : -2]
     np.testing.assert_array_equal(after_the_end, np.ones((HEIGHT, WIDTH, 3)))

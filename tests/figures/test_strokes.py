@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -12,13 +11,14 @@ import torch
 from PIL import Image
 
 from forbes.commands.cli import main
-from forbes.commands.figures import group
 from forbes.data import SequenceDataModule, Strokes
 from forbes.data.strokes.file import StrokeArrays, save_strokes
 from forbes.evaluation.runs import load_runs
+from forbes.figures.elbo import FamilyCurves, draw_elbo, elbo_against_updates
+from forbes.figures.families import group
 from forbes.figures.grids import Panel, draw_panels
-from forbes.figures.strokes import FamilyCurves, ambiguous_digits, elbo_against_updates
-from forbes.figures.style import BLACK, BLUE, ORANGE, paper_style, save_figure
+from forbes.figures.predictions import ambiguous_digits
+from forbes.figures.style import BLACK, BLUE, METHODS, ORANGE, paper_style, save_figure
 from forbes.runs.folder import read_metrics
 
 RSSM = ["--model.init_args.belief", "GaussianBelief"]
@@ -35,13 +35,14 @@ def runs(tiny_run, tiny_config, tmp_path_factory):
 
 
 def draw(runs, output, *arguments):
-    return main(["figures", "strokes", "--runs", *runs, "-o", str(output), "--context", "3", *arguments])
+    return main(["figures", "predictions", "--runs", *runs, "-o", str(output), "--context", "3", *arguments])
 
 
 @pytest.fixture(scope="module")
 def drawn(runs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("drawn")
     assert draw(runs, folder) == 0
+    assert main(["figures", "elbo", "--runs", *runs, "-o", str(folder)]) == 0
     return folder
 
 
@@ -60,6 +61,7 @@ def test_each_figure_is_there_as_png_and_pdf(drawn):
 
 def test_the_same_runs_give_the_same_bytes(runs, drawn, tmp_path):
     draw(runs, tmp_path)
+    main(["figures", "5", "--runs", *runs, "-o", str(tmp_path)])
     for path in drawn.iterdir():
         assert path.read_bytes() == (tmp_path / path.name).read_bytes()
 
@@ -67,8 +69,8 @@ def test_the_same_runs_give_the_same_bytes(runs, drawn, tmp_path):
 def test_runs_that_differ_in_the_seed_only_are_one_family(runs, tmp_path):
     families = group(load_runs(runs))
     assert [family.name for family in families] == ["FORBES", "RSSM"]
-    assert [len(family.curves) for family in families] == [2, 1]
-    assert families[0].colour != families[1].colour
+    assert [len(family.curves()) for family in families] == [2, 1]
+    assert [family.style for family in families] == [METHODS["FORBES"], METHODS["RSSM"]]
 
 
 def test_families_of_one_name_are_told_apart_by_their_folders(runs, tiny_config, tmp_path):
@@ -89,7 +91,7 @@ def test_a_family_curve_is_the_mean_and_ends_in_the_test_elbo(runs, tmp_path):
         metric = {"test/elbo[bernoulli,S=16]": {"mean": mean, "standard_error": 1.0, "checkpoint": checkpoint}}
         (tmp_path / run.path / "evaluation.json").write_text(json.dumps(metric))
 
-    (axes,) = elbo_against_updates(group(load_runs(copies)), {}).axes
+    (axes,) = draw_elbo(copies)["elbo"].axes
 
     forbes, marker, rssm, _ = axes.lines
     curves = [read_metrics(run)["val/elbo[bernoulli,S=1]"].dropna() for run in runs]
@@ -106,9 +108,7 @@ def test_a_family_curve_is_the_mean_and_ends_in_the_test_elbo(runs, tmp_path):
 
 def test_a_family_is_drawn_where_all_its_runs_have_values():
     curves = [pd.Series([-3.0, -2.0, -1.0], [10, 20, 30]), pd.Series([-5.0, -4.0], [10, 20])]
-    (axes,) = elbo_against_updates(
-        [FamilyCurves("A", BLUE, SimpleNamespace(bound_name="elbo[S=1]"), curves, [])], {}
-    ).axes
+    (axes,) = elbo_against_updates([FamilyCurves("A", METHODS["FORBES"], "elbo[S=1]", curves, [])], {}).axes
     assert axes.get_ylabel() == "validation ELBO[S=1]\nnats per sequence"
     assert list(axes.lines[0].get_xdata()) == [10, 20]
     assert list(axes.lines[0].get_ydata()) == [-4.0, -3.0]
@@ -121,9 +121,8 @@ def test_families_of_other_bounds_are_drawn_by_their_own(runs, tiny_config, tmp_
     assert main([*fit, vector, "--model.model", "VectorModel", "--model.state_dim", "0"]) == 0
     for run, metric in [(particle, "test/elbo[bernoulli,S=16]"), (vector, "test/pll[bernoulli,K=128]")]:
         (tmp_path / run / "evaluation.json").write_text(json.dumps({metric: {"mean": -90.0}}))
-    families = group(load_runs([runs[0], particle, vector]))
 
-    (axes,) = elbo_against_updates(families, {}).axes
+    (axes,) = draw_elbo([runs[0], particle, vector])["elbo"].axes
 
     assert axes.get_ylabel() == "validation bound\nnats per sequence"
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [
@@ -169,7 +168,7 @@ def test_other_digits_can_be_named(runs, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--index", "12"], "--index 12: the test split has 12 digits"),
+        (["--index", "12"], "--index 12: the test split has 12 sequences"),
         (["--context", "6"], "--context 6: expected less than the length"),
         (["--samples", "none"], "--samples"),
     ],
@@ -192,7 +191,7 @@ def test_its_help_says_how_digits_are_chosen(capsys):
     with pytest.raises(SystemExit):
         main(["figures", "--help"])
     out = " ".join(capsys.readouterr().out.split())
-    assert "forbes figures strokes --runs" in out
+    assert "forbes figures predictions --runs" in out
     assert "The choice does not depend on any model" in out
 
 

@@ -51,7 +51,9 @@ def test_an_export_has_no_optimizer_and_is_smaller(run, exported):
 def test_an_export_is_evaluated_validated_and_drawn(exported, in_tmp_path):
     assert main(["evaluate", str(exported), *FEW]) == 0
     assert main(["complete", str(exported), "-o", "a.png", "--context", "3", "--samples", "2"]) == 0
-    assert main(["figures", "strokes", "--runs", str(exported), "--index", "0", "--context", "3", "-o", "drawn"]) == 0
+    assert (
+        main(["figures", "predictions", "--runs", str(exported), "--index", "0", "--context", "3", "-o", "drawn"]) == 0
+    )
     assert main(["validate", "--config", str(exported.config), "--ckpt_path", str(exported.checkpoint)]) == 0
 
     assert (in_tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")

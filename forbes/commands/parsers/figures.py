@@ -3,36 +3,43 @@
 from pathlib import Path
 
 from forbes.commands.arguments import ArgumentParser, positive
+from forbes.figures.catalogue import find_figure
 
-__all__ = ["parser"]
+__all__ = ["OPTIONS", "parser"]
 
 _DESCRIPTION = """\
-Draw the paper's figures from run folders, each as PNG and PDF.
+Draw a figure of the paper from run folders, as PNG and PDF. It may be given by its number.
 
-  forbes figures strokes --runs runs/compare/forbes-0 runs/compare/rssm-0 -o figures
-  forbes figures agents --runs runs/hike/forbes-{0,1,2} runs/hike/dreamer-{0,1,2} -o figures
+  forbes figures list
+  forbes figures predictions --runs runs/compare/forbes-0 runs/compare/rssm-0 -o figures
+  forbes figures 5 --runs runs/compare/forbes-{0,1,2} runs/compare/rssm-{0,1,2} -o figures
 
-agents: returns, the returns of agents on one task without exploration against env steps. Runs whose folder names
-differ only in the number at the end form one curve, their mean and range, named after the folders (here forbes and
-dreamer).
+Runs that differ only in the seed form a family. It is drawn as the mean and range over its runs; predictions are those
+of the first. A family trained with another bound than the ELBO is drawn with that bound, as the legend states.
 
-strokes: predictions-t30 (Figure 4), the same predictions up to the end of the longest digit, and elbo (Figure 5). Runs
-that differ only in the seed form a family: Figure 4 shows the first of them, Figure 5 their mean and range. A family
-trained with another bound than the ELBO is drawn with that bound, as the legend states.
 The digits of Figure 4, unless given by --index, are the most ambiguous of each class among the first 500 test digits,
 by the labels of the 50 nearest training digits. The choice does not depend on any model."""
+
+OPTIONS = ("index", "samples", "mean", "context")
+"""Options that belong to some figures only. They are None unless given; defaults are those of the figure."""
 
 
 def parser() -> ArgumentParser:
     """Return the parser of `forbes figures`."""
     command = ArgumentParser("forbes figures", _DESCRIPTION)
-    command.add_argument("experiment", choices=["strokes", "agents"], help="experiment to draw")
-    command.add_argument("--runs", nargs="+", required=True, metavar="RUN", help="run folders written by `forbes fit`")
+    command.add_argument("name", metavar="NAME", type=_name, help="figure, its number in the paper, or list")
+    command.add_argument("--runs", nargs="+", metavar="RUN", help="run folders written by `forbes fit`")
     command.add_argument("-o", "--output", type=Path, default=Path("figures"), help="output folder (default: figures)")
-    command.add_argument("--index", type=int, nargs="+", help="indices of the test digits in Figure 4")
-    command.add_argument("--samples", type=positive, default=6, help="completions per digit (default: 6)")
-    command.add_argument(
-        "--mean", action="store_true", help="for written strokes, draw pixel probabilities instead of samples"
+    some = command.add_argument_group("options of some figures")
+    some.add_argument("--index", type=int, nargs="+", help="indices of the test sequences to draw")
+    some.add_argument("--samples", type=positive, help="completions of each sequence (predictions: 6)")
+    some.add_argument(
+        "--mean", action="store_true", default=None, help="draw pixel probabilities of written strokes, not samples"
     )
-    command.add_argument("--context", type=positive, default=15, help="frames that the models see (default: 15)")
+    some.add_argument("--context", type=positive, help="frames that the models see (predictions: 15)")
     return command
+
+
+def _name(text: str) -> str:
+    """Return the name of a figure, given by its name or number (an argparse type)."""
+    return text if text == "list" else find_figure(text).name

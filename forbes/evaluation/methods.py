@@ -1,0 +1,164 @@
+"""Runs as they are recorded: their method and task from config.yaml, their curves from metrics.jsonl.
+
+No model is loaded, so runs can be drawn while they train, or where their checkpoint is missing.
+"""
+
+import re
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from forbes.errors import ForbesError
+from forbes.runs.folder import RunFolder, read_config, read_metrics
+
+__all__ = ["LAYERS", "TRAJECTORIES", "RecordedRun", "group_by_method", "read_run", "returns_of"]
+
+_GAUSSIAN = {"WorldModel": "RSSM", "ImaginationActorCritic": "Dreamer", "PlanningAgent": "PlaNet"}
+"""Published names of what learns a Gaussian belief, by its class."""
+_SHOWN = {"exact_belief": "exact belief", "nothing": "no observation"}
+"""Names of agents that observe something else than the observation."""
+
+TRAJECTORIES, LAYERS = "trajectories", "mlp_layers"
+_SETTINGS = {TRAJECTORIES: "N = {}", LAYERS: "{} layers"}
+"""Settings that the paper varies, and how they are written."""
+
+
+class RecordedRun(NamedTuple):
+    """A run folder, without its model."""
+
+    path: str
+    """Path as the user typed it."""
+    method: str
+    """Published name of the agent or world model, e.g. Dreamer."""
+    task: str
+    """Task of an agent; for others the name of the folder or class of their data."""
+    settings: dict[str, Any]
+    """Those of N (`trajectories`) and `mlp_layers` that its configuration has."""
+    config: dict[str, Any]
+    """Sections `model` and `data` of config.yaml without seeds: equal for runs that differ only in the seed."""
+
+
+def read_run(path: str) -> RecordedRun:
+    """Read the configuration of a run.
+
+    Raises:
+        ForbesError: if it is missing or damaged.
+    """
+    file = RunFolder(path).config
+    if not file.is_file():
+        raise ForbesError(f"{path}: not a run folder, config.yaml is missing. Name a folder written by `forbes fit`")
+    found = read_config(file)
+    config = {name: _without_seed(found[name]) for name in ("model", "data")}
+    arguments = config["model"]["init_args"]
+    settings = {name: arguments[name] for name in _SETTINGS if name in arguments}
+    return RecordedRun(path, _method(config), _task(config["data"]["init_args"]), settings, config)
+
+
+def _without_seed(section: dict[str, Any]) -> dict[str, Any]:
+    return section | {"init_args": {name: value for name, value in section["init_args"].items() if name != "seed"}}
+
+
+def _method(config: dict[str, Any]) -> str:
+    """Return the published name of an agent or world model."""
+    arguments = config["model"]["init_args"]
+    shown = _part(_part(config["data"]["init_args"], "source", "init_args"), "options").get("shows")
+    if shown in _SHOWN:
+        return _SHOWN[shown]
+    kind = _class(_part(arguments, "model"))
+    if kind not in ("", "StateSpaceModel"):
+        return kind.removesuffix("Model")
+    posterior, prior = (_class(_part(arguments, name)) for name in ("belief", "prior"))
+    belief = prior if prior and posterior == "GaussianBelief" else posterior  # FORBES may have a flow in one only
+    if belief == "GaussianBelief":
+        return _GAUSSIAN.get(learner := _class(config["model"]), learner)
+    return "FORBES" if belief == "FlowBelief" else belief.removesuffix("Belief")
+
+
+def _task(arguments: dict[str, Any]) -> str:
+    """Return the task of an agent, or the name of a world model's data."""
+    source = _part(arguments, "source")
+    options = _part(source, "init_args")
+    if "task" in options:
+        return str(options["task"])
+    return Path(options["path"]).name if options.get("path") else _class(source)
+
+
+def _part(section: dict[str, Any], *names: str) -> dict[str, Any]:
+    """Return a nested section, empty if it is not there."""
+    for name in names:
+        found = section.get(name)
+        section = found if isinstance(found, dict) else {}
+    return section
+
+
+def _class(section: dict[str, Any]) -> str:
+    """Return the name of a class in a configuration, without its module."""
+    return str(section.get("class_path", "")).rpartition(".")[2]
+
+
+def group_by_method(
+    runs: Sequence[RecordedRun], always: Collection[str] = ()
+) -> dict[str, dict[str, list[RecordedRun]]]:
+    """Group runs whose configurations differ only in the seed: runs by task and title, in the order of the runs.
+
+    The title is the method with the settings in which its runs differ, e.g. `Dreamer, N = 4`. If two configurations of
+    a task would share a title, the name of their folder is appended, or its whole path.
+
+    Args:
+        runs: runs of any tasks.
+        always: settings that are always in the title, e.g. `trajectories`.
+    """
+    members: dict[str, list[list[RecordedRun]]] = {}
+    for run in runs:
+        of_task = members.setdefault(run.task, [])
+        same = next((others for others in of_task if others[0].config == run.config), None)
+        if same is None:
+            of_task.append([run])
+        else:
+            same.append(run)
+    grouped: dict[str, dict[str, list[RecordedRun]]] = {}
+    for task, of_task in members.items():
+        grouped[task] = dict(zip(_titles([of_one[0] for of_one in of_task], runs, always), of_task, strict=True))
+    return grouped
+
+
+def _titles(firsts: Sequence[RecordedRun], runs: Sequence[RecordedRun], always: Collection[str]) -> list[str]:
+    """Return a different title for each configuration of a task, given its first run."""
+    plain = [_title(run, runs, always) for run in firsts]
+    titles = plain
+    for name in (_folder, str):
+        titles = [
+            title if titles.count(title) == 1 else f"{short} ({name(run.path)})"
+            for title, short, run in zip(titles, plain, firsts, strict=True)
+        ]
+    return titles
+
+
+def _title(run: RecordedRun, runs: Sequence[RecordedRun], always: Collection[str]) -> str:
+    same = [other for other in runs if other.method == run.method]
+    shown = [
+        text.format(run.settings[name])
+        for name, text in _SETTINGS.items()
+        if name in run.settings and (name in always or len({other.settings.get(name) for other in same}) > 1)
+    ]
+    return ", ".join([run.method, *shown])
+
+
+def _folder(path: str) -> str:
+    """Return the name that the folders of one configuration share: that of the experiment, without the seed."""
+    folder = RunFolder(path).path.absolute()
+    return folder.parent.name if re.match(r"\d{8}-\d{6}-", folder.name) else re.sub(r"-\d+$", "", folder.name)
+
+
+def returns_of(run: RecordedRun) -> pd.Series:
+    """Return the returns of an agent without exploration, indexed by env steps.
+
+    Raises:
+        ForbesError: if none was measured.
+    """
+    table = read_metrics(run.path)
+    if not {"env_steps", "return/acting"} <= {*table}:
+        raise ForbesError(f"{run.path}: metrics.jsonl has no return/acting. Name runs of agents with measured returns")
+    return table[["env_steps", "return/acting"]].dropna().set_index("env_steps")["return/acting"]

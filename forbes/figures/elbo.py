@@ -1,0 +1,72 @@
+"""Figure 5 of the paper: the ELBO against updates."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from forbes.evaluation.references import reference_means
+from forbes.evaluation.runs import load_runs
+from forbes.figures.families import group, require_same_data
+from forbes.figures.style import COLUMN, Method, draw_range, draw_references, paper_style, show_settled
+
+__all__ = ["FamilyCurves", "draw_elbo", "elbo_against_updates"]
+
+
+class FamilyCurves(NamedTuple):
+    """The training curves of a family."""
+
+    label: str
+    style: Method
+    bound: str
+    """Name of the training bound, e.g. `elbo[S=1]`."""
+    curves: Sequence[pd.Series]
+    """The bound on the validation split against updates, one curve per run."""
+    tests: Sequence[float]
+    """Test ELBO of each evaluated run, if the ELBO is the training bound."""
+
+
+def draw_elbo(runs: Sequence[str]) -> dict[str, Figure]:
+    """Draw `elbo_against_updates` of the families that the runs form, with references on the validation split.
+
+    Raises:
+        ForbesError: if the runs are of different data, or one has no validation yet.
+    """
+    trained = load_runs(runs)
+    require_same_data(trained)
+    data = trained[0].data
+    count = min(data.validation_sequences, data.source.size("validation"))
+    means = reference_means(data, trained[0].model.likelihood, "validation", count)
+    families = [
+        FamilyCurves(family.label, family.style, family.model.bound_name, family.curves(), family.test_elbos())
+        for family in group(trained)
+    ]
+    return {"elbo": elbo_against_updates(families, means)}
+
+
+def elbo_against_updates(families: Sequence[FamilyCurves], references: Mapping[str, float]) -> Figure:
+    """Draw Figure 5: validation ELBO against updates, mean and range over runs; a diamond is the final test ELBO.
+
+    A family trained with another bound is drawn with that bound, and the legend then names all bounds. Dotted lines are
+    the `references` on the validation split, by name.
+    """
+    bounds = {family.bound for family in families}
+    with paper_style():
+        figure = Figure((COLUMN, 2.3), layout="constrained")
+        axes = figure.subplots()
+        for family in families:
+            table = pd.concat(family.curves, axis=1).dropna()  # updates common to all runs
+            draw_range(axes, table, family.style, family.label + (f", {family.bound}" if len(bounds) > 1 else ""))
+            if family.tests:
+                test = sum(family.tests) / len(family.tests)
+                (end,) = axes.plot(table.index.max(), test, "D", color=family.style.colour, markersize=5, zorder=3)
+                end.set(markeredgecolor="white", clip_on=False)
+        if any(family.tests for family in families):
+            axes.plot([], [], "D", color="none", markeredgecolor="black", markersize=4, label="final test")
+        show_settled(axes, [curve for family in families for curve in family.curves])
+        draw_references(axes, references)
+        title = bounds.pop().replace("elbo", "ELBO") if len(bounds) == 1 else "bound"
+        axes.set(xlabel="updates", ylabel=f"validation {title}\nnats per sequence")
+        axes.legend(loc="lower right")
+    return figure

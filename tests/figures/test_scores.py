@@ -1,0 +1,88 @@
+"""The figures of recorded scores show what `evaluation.json` says, of the runs' own checkpoints."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from command_line import error_of
+
+from forbes.commands.cli import main
+from forbes.evaluation.runs import load_runs
+from forbes.figures.scores import draw_per_step, draw_prequential
+from forbes.figures.style import METHODS
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_run, tiny_config, tmp_path_factory):
+    """An RSSM next to FORBES."""
+    run = tmp_path_factory.mktemp("scores") / "rssm"
+    rssm = ["--model.init_args.belief", "GaussianBelief"]
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run), *rssm]) == 0
+    return str(tiny_run), str(run)
+
+
+@pytest.fixture
+def record(trained, tmp_path):
+    """Copies of FORBES and RSSM with records of their scores, given as a curve by metric."""
+
+    def make(kind, name, sha256="same", checkpoint=None, **curves):
+        run = str(shutil.copytree(trained[kind], tmp_path / name))
+        (one,) = load_runs([run])
+        entries = {
+            metric: {
+                "mean": sum(curve),
+                "standard_error": 1.0,
+                "curve": curve,
+                "sequences": 12,
+                "data": {"name": "strokes", "sha256": sha256},
+                "checkpoint": checkpoint or one.checkpoint,
+            }
+            for metric, curve in {f"test/{score}[S=2]": curve for score, curve in curves.items()}.items()
+        }
+        (tmp_path / name / "evaluation.json").write_text(json.dumps(entries))
+        return run
+
+    return make
+
+
+def test_the_elbo_of_each_step_is_the_mean_over_the_runs_of_a_family(record):
+    first = record(0, "forbes-0", elbo=[-3.0, -1.0], reconstruction=[-1.0, 0.0], kl=[2.0, 1.0])
+    second = record(0, "forbes-1", elbo=[-5.0, -2.0], reconstruction=[-1.0, 0.0], kl=[4.0, 2.0])
+
+    bound, reconstruction, kl = draw_per_step([first, second])["per-step"].axes
+
+    np.testing.assert_allclose(bound.lines[0].get_xdata(), [1, 2])
+    np.testing.assert_allclose(bound.lines[0].get_ydata(), [-4.0, -1.5])
+    np.testing.assert_allclose(reconstruction.lines[0].get_ydata(), [-1.0, 0.0])
+    np.testing.assert_allclose(kl.lines[0].get_ydata(), [3.0, 1.5])
+    assert bound.lines[0].get_color() == METHODS["FORBES"].colour
+    shade = bound.collections[0].get_paths()[0].vertices
+    assert (shade[:, 1].min(), shade[:, 1].max()) == (-5.0, -1.0)
+
+
+def test_the_prequential_score_is_relative_to_the_first_family(record):
+    forbes = record(0, "forbes-0", pll=[-3.0, -1.0])
+    rssm = record(1, "rssm-0", pll=[-3.5, -2.0])
+
+    steps, totals = draw_prequential([forbes, rssm])["prequential"].axes
+
+    np.testing.assert_allclose(steps.lines[0].get_ydata(), [0.0, 0.0])
+    np.testing.assert_allclose(steps.lines[1].get_ydata(), [-0.5, -1.0])
+    assert [line.get_xdata()[0] for line in totals.lines[:2]] == [-4.0, -5.5]
+    assert [label.get_text() for label in totals.get_yticklabels()] == ["FORBES", "RSSM"]
+
+
+def test_scores_of_other_data_or_checkpoints_are_refused(record, capsys, tmp_path):
+    first = record(0, "forbes-0", pll=[-3.0, -1.0])
+    draw = ["figures", "prequential", "-o", tmp_path / "figures", "--runs", first]
+
+    for other in (
+        record(1, "rssm-0", elbo=[-3.0, -1.0]),
+        record(1, "rssm-1", pll=[-3.0, -1.0], sha256="other"),
+        record(1, "rssm-2", pll=[-3.0, -1.0], checkpoint="of an earlier epoch"),
+    ):
+        sentence = error_of(capsys, *draw, other)
+        assert "evaluation.json has no pll of this checkpoint" in sentence
+        assert f"Run: forbes evaluate {first} {other}" in sentence
+    assert not (tmp_path / "figures").exists()
