@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 from command_line import error_of
 
+from forbes.commands import compare
 from forbes.commands.cli import main
+from forbes.errors import ForbesError
 from forbes.runs.configs import shipped_configs
 
 
@@ -73,3 +75,16 @@ def test_a_training_by_names_is_that_of_the_files(in_tmp_path, capsys):
 
     assert printed[0] == printed[1]
     assert "max_epochs: 2" in printed[0]
+
+
+def test_a_comparison_names_its_runs_after_the_last_part(in_tmp_path, monkeypatch, capsys):
+    trained = []
+
+    def train(runs, flags, at_once):
+        trained.extend(runs)
+        raise ForbesError("far enough")
+
+    monkeypatch.setattr(compare, "_train", train)
+
+    assert error_of(capsys, "compare", "strokes/rssm", "strokes/forbes", "-o", "c") == "far enough"
+    assert trained == [("strokes/rssm", 0, "c/rssm-0"), ("strokes/forbes", 0, "c/forbes-0")]
