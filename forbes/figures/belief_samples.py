@@ -28,7 +28,7 @@ _COMPARED = 20
 
 
 class KnownSamples(NamedTuple):
-    """The belief of a `KnownBelief`, over the state itself."""
+    """The belief of a `KnownBelief` over the state itself, named after the method that has its family."""
 
     name: str
     data: SequenceDataModule
