@@ -10,6 +10,7 @@ MODULES = sorted(FORBES.rglob("*.py"))
 
 FOUNDATION = [
     "errors",
+    "bundled",
     "files",
     "reading",
     "child",

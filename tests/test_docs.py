@@ -23,6 +23,7 @@ PAGES = [
     *ROOT.glob("*.md"),
     *(ROOT / "docs").rglob("*.md"),
     *(ROOT / "benchmarks").glob("*.md"),
+    *(ROOT / "data").rglob("*.md"),
     ROOT / "configs/README.md",
     *(ROOT / "notebooks").glob("*.ipynb"),
 ]

@@ -51,6 +51,8 @@ COMMANDS = {
         "RUN RUN -o figures",
         "forbes.commands.completions:main",
     ),
+    "complete": Command("draw completions of digits", "RUN -o picture.png", "forbes.commands.complete:main"),
+    "export": Command("export a model to share", "RUN -o shared/model", "forbes.commands.export:main"),
     "figures": Command(
         "draw the paper's figures", "predictions --runs RUN RUN -o figures", "forbes.commands.figures:main"
     ),
@@ -65,7 +67,7 @@ usage: forbes COMMAND ...
 
 Learn, evaluate and use belief states of partially observable processes.
 
-commands, each with an example (RUN is a run folder written by `forbes fit`):
+commands, each with an example (RUN is a run folder written by `forbes fit`, or a pretrained:NAME):
 {commands}
 options:
   --help               show this page, or that of a command

@@ -38,6 +38,7 @@ from forbes.evaluation.runs import (
     split_batches,
 )
 from forbes.evaluation.scoring import PartialScores, Scorer, exact_scorer, make_scorer, score_split, with_progress
+from forbes.runs.folder import RunFolder
 from forbes.runs.provenance import command_line, commit, origin
 
 __all__ = ["WantedMetrics", "evaluate", "main", "wanted_metrics"]
@@ -61,6 +62,9 @@ def main(argv: Sequence[str]) -> None:
     if args.checkpoint is not None:
         args.runs = [str(Path(run) / "checkpoints" / args.checkpoint) for run in args.runs]
     folders = results_folders(args.runs, args.output)
+    for run, folder in folders.items():
+        if folder != RunFolder(run).results:
+            print(f"the results of {run} go to {folder}", flush=True)
     if is_agent(args.runs[0]):
         device = find_device(args.device)
         played = evaluate_agents(folders, args.episodes, args.acting_samples, args.seed, device, command)

@@ -24,6 +24,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 import forbes.callbacks  # registers their short names for configurations
+from forbes.bundled import is_pretrained
 from forbes.callbacks.divergence import StopAtDivergence
 from forbes.callbacks.picture import FileCallback
 from forbes.commands.lower_rate import MOST, LowerRateError, at_half_the_rate
@@ -139,6 +140,8 @@ class _FitOptions(NamedTuple):
         for option in ("resume", "run_dir"):
             if (folder := getattr(options, option)) and folder.endswith(".ckpt"):
                 raise ForbesError(f"--{option} {folder}: is a checkpoint, expected a run folder")
+            if folder and is_pretrained(folder):
+                raise ForbesError(f"--{option} {folder}: comes with the package, expected a folder that can be written")
         if not options.resume:
             return cls(options.experiment, options.run_dir, None, options.on_divergence), rest
         run = RunFolder.trained(options.resume)
@@ -280,6 +283,8 @@ class _Experiment(LightningCLI):
             content = read_checkpoint(Path(checkpoint))
             check_weights(self.model, weights_of(content, str(checkpoint)), str(checkpoint))
             updates = content["global_step"]
+            if self.command == "fit" and "optimizer_states" not in content:
+                raise ForbesError(f"{checkpoint}: has no optimizer, it was exported. Train a new run: --config FILE")
         how = {"datamodule": self.datamodule, "ckpt_path": checkpoint, "weights_only": True}
         if self.command in ("validate", "test"):
             how["verbose"] = False  # Lightning's table would drop text in brackets

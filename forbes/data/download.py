@@ -20,7 +20,6 @@ from forbes.files import append_whole
 __all__ = [
     "CURVES_BLOB",
     "CURVES_URL",
-    "bundled",
     "curves_path",
     "data_folder",
     "download",
@@ -36,12 +35,6 @@ CURVES_BLOB = "ab35b223497127c8eb4cf1b17db7afd4389c4faf"
 """Git blob id of the curves: 20 tasks with 5 seeds each, returns against env steps up to 4.9 million."""
 
 _LOCAL = "Give a local copy with: forbes data fetch curves --from PATH"
-
-
-def bundled(name: str) -> Path:
-    """Return the path of a bundled file: in `forbes/data/` of a wheel, in `data/` of a checkout."""
-    in_wheel = Path(__file__).with_name(name)
-    return in_wheel if in_wheel.is_file() else Path(__file__).parents[2] / "data" / name
 
 
 def data_folder() -> Path:

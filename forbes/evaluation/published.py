@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from forbes.data.download import bundled, curves_path
+from forbes.bundled import bundled
+from forbes.data.download import curves_path
 from forbes.errors import ForbesError
 from forbes.reading import read_json, readable
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from forbes.bundled import is_pretrained
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate, bootstrap_interval
 from forbes.evaluation.scoring import Scores
@@ -50,7 +51,8 @@ def results_folders(runs: Sequence[str], output: str | None = None) -> dict[str,
 
     Args:
         runs: run folders, or checkpoints in them.
-        output: parent folder, in which each run gets a folder of its name. Default: the run folder itself.
+        output: parent folder, in which each run gets a folder of its name. Default: the run folder itself, or
+            `pretrained-NAME` in the current folder for a model that comes with the package.
 
     Raises:
         ForbesError: if two runs would share a folder in `output`, or a folder is not writable.
@@ -64,7 +66,9 @@ def results_folders(runs: Sequence[str], output: str | None = None) -> dict[str,
             results = Path(output) / (name if results == folder.path else f"{name}-{folder.checkpoint.stem}")
             if results in folders.values():
                 raise ForbesError(f"{run}: another run is called {name} too. Evaluate them with different --output")
-        if folder.path.is_dir() and output is None and not os.access(folder.path, os.W_OK):
+        elif is_pretrained(run):
+            results = Path(f"pretrained-{folder.path.name}")
+        elif folder.path.is_dir() and not os.access(folder.path, os.W_OK):
             raise ForbesError(f"{run}: cannot be written to. Let the results go elsewhere: --output DIR")
         folders[run] = results
     return folders

@@ -2,12 +2,14 @@
 
 import hashlib
 import io
+import lzma
 import math
 import os
 import pickle
 import shutil
 import sys
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -26,6 +28,7 @@ __all__ = [
     "CheckpointFile",
     "ResumeWholeEpochs",
     "SaveLast",
+    "compressed_checkpoint",
     "open_checkpoint",
     "read_checkpoint",
 ]
@@ -172,6 +175,19 @@ class ResumeWholeEpochs(Callback):
         trainer.fit_loop.epoch_loop.max_steps = self._max_steps
 
 
+def compressed_checkpoint(content: Mapping[str, Any]) -> bytes:
+    """Return the bytes of a checkpoint, compressed by xz. `open_checkpoint` reads it like any other."""
+    buffer = io.BytesIO()
+    torch.save(dict(content), buffer)
+    return lzma.compress(_sealed(buffer.getvalue()), filters=[_TWO_BYTE_NUMBERS])
+
+
+_TWO_BYTE_NUMBERS = {"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 2, "lp": 1, "pb": 1}
+"""Filter of xz that models even and odd bytes separately: sign and exponent of a bfloat16, and its mantissa."""
+_XZ = b"\xfd7zXZ\0"
+_LARGEST = 2**30  # bytes of a decompressed checkpoint
+
+
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Verify a checkpoint and return its content on the CPU, as `open_checkpoint` does."""
     return open_checkpoint(path).content
@@ -200,15 +216,26 @@ def _open(path: Path) -> CheckpointFile:
     if not path.is_file():
         raise ForbesError(f"{path}: no such checkpoint. Train first, or name another run")
     content = path.read_bytes()
-    _verify(path, content)
+    archive = _decompressed(path, content) if content.startswith(_XZ) else content
+    _verify(path, archive)
     with readable(path, "a checkpoint", "Take another one", DamagedCheckpointError):
         try:
-            checkpoint: dict[str, Any] = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+            checkpoint: dict[str, Any] = torch.load(io.BytesIO(archive), map_location="cpu", weights_only=True)
         except pickle.UnpicklingError as error:
             raise UntrustedCheckpointError(
                 f"{path}: refused, it has other objects than tensors and plain values. Do not trust it"
             ) from error
     return CheckpointFile(checkpoint, hashlib.sha256(content).hexdigest())
+
+
+def _decompressed(path: Path, content: bytes) -> bytes:
+    """Return the content of an xz file, which is bounded, since a few bytes may become many."""
+    xz = lzma.LZMADecompressor(lzma.FORMAT_XZ)
+    with readable(path, "a checkpoint", "Take another one", DamagedCheckpointError):
+        archive = xz.decompress(content, _LARGEST)
+    if not xz.eof:
+        raise DamagedCheckpointError(f"{path}: truncated, or more than {_LARGEST >> 30} GiB. Take another one")
+    return archive
 
 
 def _verify(path: Path, content: bytes) -> None:

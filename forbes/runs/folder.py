@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 import forbes
+from forbes.bundled import run_path
 from forbes.errors import ForbesError
 from forbes.files import locked, remove_halves, require_no_links
 from forbes.reading import is_number, read_yaml
@@ -37,13 +38,16 @@ class RunFolder:
 
     Args:
         path: run folder, which need not exist yet; or one of its checkpoints, e.g. `RUN/checkpoints/best.ckpt`, to use
-            instead of the last one.
+            instead of the last one; or `pretrained:NAME`, a model that comes with the package.
+
+    Raises:
+        ForbesError: if no trained model of this name comes with the package.
     """
 
     LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 
     def __init__(self, path: Path | str) -> None:
-        path = Path(path)
+        path = run_path(path)
         chosen = path if path.suffix == ".ckpt" else None
         self.path = path if chosen is None else path.parent.parent
         self.config = self.path / "config.yaml"

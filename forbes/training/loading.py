@@ -19,14 +19,15 @@ def load_run(run: Path | str) -> tuple[WorldModel, SequenceDataModule]:
     """Load a run's world model, on the CPU and in evaluation mode, and its data, without a Trainer.
 
     Args:
-        run: run folder, for its last checkpoint, or a checkpoint in it.
+        run: run folder, for its last checkpoint, or a checkpoint in it; or `pretrained:NAME`, a trained model of the
+            package (`forbes export --help` lists them).
 
     Raises:
         ForbesError: when the folder holds no trained run or one of another kind, or when configuration and checkpoint
             do not fit together.
 
     Example:
-        >>> world, data = forbes.load_run("runs/forbes-0")  # forbes fit strokes/forbes --run_dir runs/forbes-0
+        >>> world, data = forbes.load_run("pretrained:strokes-forbes")
         >>> world.terms(data.sequences("test", torch.arange(8))).elbo.shape
         torch.Size([8])
     """

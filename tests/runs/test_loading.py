@@ -46,7 +46,7 @@ def test_a_loaded_model_has_the_trained_weights_and_outputs(tiny_run):
 def test_a_run_without_a_checkpoint_is_one_sentence(run):
     run.checkpoint.unlink()
 
-    with pytest.raises(ForbesError, match=r"run: has no checkpoint yet\. Train it: forbes fit --config .*config\.yaml"):
+    with pytest.raises(ForbesError, match=r"run: has no checkpoint yet\. Train it: forbes fit .*config\.yaml"):
         load_run(run.path)
 
 

@@ -16,6 +16,7 @@ Evaluate trained models by likelihood bounds and proper scores, and compare them
   forbes evaluate runs/compare/forbes-0 runs/compare/rssm-0
   forbes evaluate runs/compare/forbes-0 --scores elbo pll --sequences 200
   forbes evaluate runs/agent/forbes-0 runs/agent/dreamer-0 --episodes 20
+  forbes evaluate pretrained:strokes-forbes pretrained:strokes-rssm --sequences 100
 
 Scores are nats per sequence of observations, fully normalised, without free nats, as mean and standard error over
 sequences. The KL is the Monte-Carlo estimate for every family. The ELBO alone does not identify a good belief, since
@@ -33,8 +34,8 @@ For data of a known process there is also log_p, the exact log p(o_1..T), which 
 bounds: its likelihood is exact, and is reported as pll. A ParticleModel uses its own particles for pll and open-loop.
 
 pll, fivo and open-loop score the first {SUBSET} sequences, as the names of the metrics show. Writes evaluation.json,
-and evaluation.npz with the scores of each sequence, to each run folder. If interrupted, the same command resumes where
-it stopped.
+and evaluation.npz with the scores of each sequence, to each run folder, and for pretrained:NAME to pretrained-NAME in
+the current folder. If interrupted, the same command resumes where it stopped.
 
 Agents play the same --episodes without exploration; their score is the return. In these episodes are also measured:
 - R² of the rewards predicted from the belief, for the current step and 1, 5 and 15 steps ahead (1 = perfect, 0 = no
@@ -58,7 +59,10 @@ def parser() -> ArgumentParser:
     """Return the parser of `forbes evaluate`."""
     command = ArgumentParser("forbes evaluate", _DESCRIPTION)
     command.add_argument(
-        "runs", nargs="+", metavar="RUN", help="run folder written by `forbes fit`, or a checkpoint in it"
+        "runs",
+        nargs="+",
+        metavar="RUN",
+        help="run folder written by `forbes fit`, or a checkpoint in it; or pretrained:NAME (`forbes export --help`)",
     )
     command.add_argument(
         "--checkpoint", metavar="NAME", help="checkpoint in checkpoints/ of every RUN (default: last.ckpt)"
@@ -72,7 +76,7 @@ def parser() -> ArgumentParser:
 
 def add_output(parser: argparse.ArgumentParser) -> None:
     """Add the option for the folder of the results."""
-    parser.add_argument("--output", metavar="DIR", help="write results to DIR/NAME-OF-RUN instead of the run folders")
+    parser.add_argument("--output", metavar="DIR", help="write results to DIR/NAME-OF-RUN instead")
 
 
 def add_acting_samples(parser: argparse.ArgumentParser) -> None:

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from forbes.data.download import bundled
+from forbes.bundled import bundled
 from forbes.errors import ForbesError
 from forbes.files import npz_bytes, replace_file
 from forbes.reading import read_npz

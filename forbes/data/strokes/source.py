@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from forbes.data.download import bundled
+from forbes.bundled import bundled
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.strokes.dejong import dejong_path, verify_dejong
 from forbes.data.strokes.file import SIDE, StrokeArrays, load_strokes, sha256_of_arrays
