@@ -8,7 +8,7 @@ from typing import NamedTuple
 from forbes.commands.trainings import Training
 from forbes.evaluation.claims import DMC_TASKS
 from forbes.evaluation.contrasts import task_of
-from forbes.figures.catalogue import FIGURES, find_figure
+from forbes.figures.catalogue import find_figure
 
 __all__ = ["Family", "Planned", "Step", "collections", "families", "figures", "measures", "trainings"]
 
@@ -281,8 +281,7 @@ _FIGURES = (
 def figures(planned: Sequence[Planned], folder: Path) -> list[Step]:
     """Return the commands that draw the figures of finished runs, each into a folder of its own.
 
-    Each figure compares families, so it is left out if fewer than two of them have a run. Names that are not in the
-    catalogue are left out too.
+    Each figure compares families, so it is left out if fewer than two of them have a run.
     """
     steps = []
     for name, about, shown, seeds in _FIGURES:
@@ -292,7 +291,7 @@ def figures(planned: Sequence[Planned], folder: Path) -> list[Step]:
             for one in planned
             if one.family.name == family and (seeds is None or one.training.seed < seeds)
         ]
-        if len({one.family.name for one in members}) > 1 and name in {entry.name for entry in FIGURES}:
+        if len({one.family.name for one in members}) > 1:
             runs = tuple(one.training.folder for one in members)
             output, entry = folder / "figures" / f"{name}-{about}", find_figure(name)
             number = f"Figure {entry.number}" if entry.number.isdigit() else entry.number
