@@ -80,8 +80,8 @@ def test_a_training_by_names_is_that_of_the_files(in_tmp_path, capsys):
 def test_a_comparison_names_its_runs_after_the_last_part(in_tmp_path, monkeypatch, capsys):
     trained = []
 
-    def train(runs, flags, at_once):
-        trained.extend(runs)
+    def train(trainings, at_once):
+        trained.extend((one.config, one.seed, one.folder) for one in trainings)
         raise ForbesError("far enough")
 
     monkeypatch.setattr(compare, "_train", train)

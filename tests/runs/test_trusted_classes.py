@@ -123,7 +123,7 @@ def test_a_run_folder_that_somebody_sends_runs_nothing(tiny_run, tmp_path, mark,
     config["model"]["init_args"][place] = attacks(mark)[number]
     (run / "config.yaml").write_text(yaml.safe_dump(config))
 
-    for command in (["evaluate", str(run)], ["figures", "strokes", "--runs", str(run)], ["fit", "--resume", str(run)]):
+    for command in (["evaluate", str(run)], ["figures", "elbo", "--runs", str(run)], ["fit", "--resume", str(run)]):
         assert main(command) == 2
         assert f"model.{place}: " in capsys.readouterr().err
     assert main(["fit", "--config", str(run / "config.yaml"), "--run_dir", str(tmp_path / "new")]) == 2
