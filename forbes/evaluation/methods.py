@@ -13,7 +13,7 @@ import pandas as pd
 from forbes.errors import ForbesError
 from forbes.runs.folder import RunFolder, read_config, read_metrics
 
-__all__ = ["LAYERS", "TRAJECTORIES", "RecordedRun", "group_by_method", "read_run", "returns_of"]
+__all__ = ["LAYERS", "TRAJECTORIES", "RecordedRun", "group_by_method", "read_run", "returns_of", "with_suffix"]
 
 _GAUSSIAN = {"WorldModel": "RSSM", "ImaginationActorCritic": "Dreamer", "PlanningAgent": "PlaNet"}
 """Published names of what learns a Gaussian belief, by its class."""
@@ -31,7 +31,7 @@ class RecordedRun(NamedTuple):
     path: str
     """Path as the user typed it."""
     method: str
-    """Published name of the agent or world model, e.g. Dreamer."""
+    """Published name of the agent or world model with the suffix of the experiment's, e.g. Dreamer or RSSM wide."""
     task: str
     """Task of an agent; for others the name of the folder or class of their data."""
     settings: dict[str, Any]
@@ -58,7 +58,16 @@ def read_run(path: str) -> RecordedRun:
     config = {name: _without_seed(found[name]) for name in ("model", "data")}
     arguments = config["model"]["init_args"]
     settings = {name: arguments[name] for name in _SETTINGS if name in arguments}
-    return RecordedRun(path, _method(config), _task(config["data"]["init_args"]), settings, config)
+    method = with_suffix(_method(config), path)
+    return RecordedRun(path, method, _task(config["data"]["init_args"]), settings, config)
+
+
+def with_suffix(method: str, path: str) -> str:
+    """Append the suffix of the experiment's name in a run's path: RSSM wide for `runs/rssm_wide-0`."""
+    for part in reversed(Path(path).resolve().parts):
+        if match := re.search(rf"(?<![a-z]){method}((?:_[a-z]+)+)(?![a-z\d])", part, re.IGNORECASE):
+            return method + match[1].replace("_", " ")
+    return method
 
 
 def _without_seed(section: dict[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +12,7 @@ from torch import nn
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
+from forbes.evaluation.methods import with_suffix
 from forbes.models import BeliefModel, StateSpaceModel
 from forbes.training.loading import open_run
 
@@ -41,11 +41,7 @@ class TrainedRun(NamedTuple):
 
         A suffix of the experiment's name is appended: RSSM wide for `rssm_wide`.
         """
-        name = model_name(self.model)
-        for part in reversed(Path(self.path).resolve().parts):
-            if match := re.search(rf"(?<![a-z]){name}((?:_[a-z]+)+)(?![a-z])", part, re.IGNORECASE):
-                return name + match[1].replace("_", " ")
-        return name
+        return with_suffix(model_name(self.model), self.path)
 
     @property
     def parameters(self) -> int:
