@@ -4,17 +4,22 @@ from pathlib import Path
 
 from forbes.errors import ForbesError
 
-__all__ = ["PRETRAINED", "bundled", "is_pretrained", "pretrained_names", "run_path"]
+__all__ = ["PRETRAINED", "bundled", "is_pretrained", "pretrained_names", "run_path", "shipped"]
 
 PRETRAINED = "pretrained:"
 """Prefix of the name of a trained model that comes with the package."""
 
 
-def bundled(name: str) -> Path:
-    """Return the path of a bundled file or folder: in `forbes/data/` of a wheel, in `data/` of a checkout."""
+def shipped(name: str) -> Path:
+    """Return the path of a file or folder that is in `forbes/` of a wheel, and next to `forbes/` in a checkout."""
     package = Path(__file__).parent
-    in_wheel = package / "data" / name
-    return in_wheel if in_wheel.exists() else package.parent / "data" / name
+    in_wheel = package / name
+    return in_wheel if in_wheel.exists() else package.parent / name
+
+
+def bundled(name: str) -> Path:
+    """Return the path of a file or folder of `data/` that comes with the package."""
+    return shipped(f"data/{name}")
 
 
 def pretrained_names() -> list[str]:

@@ -1,7 +1,6 @@
 """Measure the contrast of a claim from the records of runs, seed by seed, and check Theorem 1 in closed form."""
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from forbes.errors import ForbesError
 from forbes.evaluation.claims import Claim
 from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.metrics import score_of
 from forbes.evaluation.record import read_arrays, read_record
 from forbes.evaluation.theorem import (
     ClosedFormProcess,
@@ -27,22 +27,15 @@ from forbes.evaluation.theorem import (
 )
 from forbes.reading import is_number, read_json
 
-__all__ = ["TheoremGaps", "contrast", "entry_of", "score_name", "task_of"]
-__all__ += ["theorem_gaps"]
+__all__ = ["TheoremGaps", "contrast", "entry_of", "task_of", "theorem_gaps"]
 
 Runs = Mapping[tuple[str, int], str]
 """Folders of finished runs by family and seed."""
 
 
-def score_name(metric: str) -> str:
-    """Return the score in a metric's full name, e.g. `pll` for `test[:1000]/pll[bernoulli,K=128]`."""
-    match = re.search(r"(\w+)\[[^\[\]]*\]$", metric)
-    return match[1] if match else metric
-
-
 def entry_of(run: str, score: str) -> tuple[str, dict[str, Any]] | None:
     """Return the newest entry of a score in a run's record, with its full name; None if there is none."""
-    entries = [(name, entry) for name, entry in read_record(run).items() if score_name(name) == score]
+    entries = [(name, entry) for name, entry in read_record(run).items() if score_of(name) == score]
     return max(entries, key=lambda found: str(found[1].get("date", "")), default=None)
 
 
@@ -128,7 +121,7 @@ def _completed(claim: Claim, path: Path | None) -> Estimate | None:
     if path is None or not path.is_file():
         return None
     for entry in read_json(path, "Delete it, and repeat the command")["scores"]:
-        if entry["minus"] is not None and score_name(entry["metric"]) == claim.score:
+        if entry["minus"] is not None and score_of(entry["metric"]) == claim.score:
             mean, error = entry["mean"], entry["standard_error"]
             return Estimate(claim.sign * mean, error) if is_number(mean) and is_number(error) else None
     return None

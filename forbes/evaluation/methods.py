@@ -14,6 +14,7 @@ from forbes.errors import ForbesError
 from forbes.runs.folder import RunFolder, read_config, read_metrics
 
 __all__ = ["LAYERS", "TRAJECTORIES", "RecordedRun", "group_by_method", "read_run", "returns_of", "with_suffix"]
+__all__ += ["without_seed"]
 
 _GAUSSIAN = {"WorldModel": "RSSM", "ImaginationActorCritic": "Dreamer", "PlanningAgent": "PlaNet"}
 """Published names of what learns a Gaussian belief, by its class."""
@@ -55,7 +56,7 @@ def read_run(path: str) -> RecordedRun:
     if not file.is_file():
         raise ForbesError(f"{path}: not a run folder, config.yaml is missing. Name a folder written by `forbes fit`")
     found = read_config(file)
-    config = {name: _without_seed(found[name]) for name in ("model", "data")}
+    config = {name: without_seed(found[name]) for name in ("model", "data")}
     arguments = config["model"]["init_args"]
     settings = {name: arguments[name] for name in _SETTINGS if name in arguments}
     method = with_suffix(_method(config), path)
@@ -70,8 +71,10 @@ def with_suffix(method: str, path: str) -> str:
     return method
 
 
-def _without_seed(section: dict[str, Any]) -> dict[str, Any]:
-    return section | {"init_args": {name: value for name, value in section["init_args"].items() if name != "seed"}}
+def without_seed(section: dict[str, Any]) -> dict[str, Any]:
+    """Return a section of a configuration without its seed."""
+    arguments = {name: value for name, value in section.get("init_args", {}).items() if name != "seed"}
+    return section | {"init_args": arguments}
 
 
 def _method(config: dict[str, Any]) -> str:

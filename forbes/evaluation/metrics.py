@@ -57,7 +57,7 @@ class Pair(NamedTuple):
 
 def score_of(metric: str) -> str:
     """Return the score in a metric's full name, e.g. `pll` for `test[:1000]/pll[bernoulli,K=128]`."""
-    return metric.partition("/")[2].partition("[")[0]
+    return metric.rpartition("/")[2].partition("[")[0]
 
 
 def compare_pairs(measured: Sequence[EvaluatedRun]) -> list[Pair]:

@@ -12,7 +12,7 @@ from torch import nn
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
-from forbes.evaluation.methods import with_suffix
+from forbes.evaluation.methods import with_suffix, without_seed
 from forbes.models import BeliefModel, StateSpaceModel
 from forbes.training.loading import open_run
 
@@ -96,7 +96,7 @@ def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
     runs = []
     for path in paths:
         module, data, config, checkpoint = open_run(path)
-        sections = {key: _without_seed(config[key]) for key in ("model", "data")}
+        sections = {key: without_seed(config[key]) for key in ("model", "data")}
         runs.append(TrainedRun(path, module.model.to(device), data, checkpoint, sections))
     return runs
 
@@ -107,11 +107,6 @@ def _kind(model: BeliefModel) -> type[nn.Module]:
         return type(model)
     prior, posterior = model.prior, model.posterior
     return type(prior if isinstance(posterior, GaussianBelief) else posterior)  # FORBES may have a flow in one only
-
-
-def _without_seed(section: dict[str, Any]) -> dict[str, Any]:
-    arguments = {key: value for key, value in section.get("init_args", {}).items() if key != "seed"}
-    return section | {"init_args": arguments}
 
 
 def split_batches(

@@ -5,7 +5,7 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
-import forbes
+from forbes.bundled import shipped
 from forbes.errors import ForbesError
 
 __all__ = ["config_folder", "find_config", "shipped_configs", "with_config_paths"]
@@ -15,9 +15,7 @@ _FLAGS = ("--config", "-c")
 
 def config_folder() -> Path:
     """Return the folder of the package's configurations: `forbes/configs/` of a wheel, `configs/` of a checkout."""
-    package = Path(forbes.__file__).parent
-    in_wheel = package / "configs"
-    return in_wheel if in_wheel.is_dir() else package.parent / "configs"
+    return shipped("configs")
 
 
 def shipped_configs() -> dict[str, Path]:
@@ -39,10 +37,10 @@ def find_config(name: str) -> Path:
     path = Path(name)
     if path.exists() and not path.is_dir():  # a pipe is not a file
         return path
-    shipped = shipped_configs()
-    if name not in shipped:
-        raise ForbesError(f"{name}: no such configuration.{_nearest(name, list(shipped))} List all: forbes configs")
-    return shipped[name]
+    files = shipped_configs()
+    if name not in files:
+        raise ForbesError(f"{name}: no such configuration.{_nearest(name, list(files))} List all: forbes configs")
+    return files[name]
 
 
 def with_config_paths(arguments: Sequence[str]) -> list[str]:
@@ -66,9 +64,9 @@ def with_config_paths(arguments: Sequence[str]) -> list[str]:
     return found
 
 
-def _nearest(name: str, shipped: Sequence[str]) -> str:
+def _nearest(name: str, known: Sequence[str]) -> str:
     """Suggest up to three names: those with the same last part, else those that are spelled alike."""
     asked = name.removeprefix("./").removeprefix("configs/").removesuffix(".yaml")
-    near = [asked] if asked in shipped else sorted((s for s in shipped if s.endswith(f"/{asked}")), key=len)
-    *others, last = (near or difflib.get_close_matches(asked, shipped))[:3] or [""]
+    near = [asked] if asked in known else sorted((s for s in known if s.endswith(f"/{asked}")), key=len)
+    *others, last = (near or difflib.get_close_matches(asked, known))[:3] or [""]
     return f" Did you mean {', '.join(others)}{' or ' if others else ''}{last}?" if last else ""

@@ -11,8 +11,9 @@ import torch
 from forbes.errors import ForbesError
 from forbes.evaluation import claims
 from forbes.evaluation.claims import CLAIMS, Claim, Held, decide, mean_over_seeds
-from forbes.evaluation.contrasts import contrast, entry_of, score_name, theorem_gaps
+from forbes.evaluation.contrasts import contrast, entry_of, theorem_gaps
 from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.metrics import score_of
 
 TRIALS = 20_000
 
@@ -85,7 +86,7 @@ def test_the_error_has_a_part_of_the_seeds_and_one_of_the_sequences():
     [("test[:1000]/pll[bernoulli,K=128]", "pll"), ("test/elbo[S=2]", "elbo"), ("return[episodes=2]", "return")],
 )
 def test_a_score_is_found_in_the_name_of_its_metric(metric, score):
-    assert score_name(metric) == score
+    assert score_of(metric) == score
 
 
 @pytest.fixture

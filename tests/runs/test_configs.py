@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-import forbes
 from forbes.errors import ForbesError
 from forbes.runs.configs import config_folder, find_config, shipped_configs, with_config_paths
 
@@ -23,7 +22,7 @@ def test_the_configurations_of_a_wheel_are_inside_the_package(tmp_path, monkeypa
     (package / "configs" / "strokes").mkdir(parents=True)
     file = package / "configs" / "strokes" / "only.yaml"
     file.write_text("")
-    monkeypatch.setattr(forbes, "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr("forbes.bundled.__file__", str(package / "bundled.py"))
 
     assert shipped_configs() == {"strokes/only": file}
     assert find_config("strokes/only") == file

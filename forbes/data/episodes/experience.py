@@ -220,7 +220,7 @@ class Experience(SequenceSource):
         return self._require_replay().latest(count)
 
     def gather(self, split: Split, index: Tensor, length: int) -> Segments:
-        """Return segments by index, int64 (B,), read from the mapped files."""
+        """Return segments by index, int64 (B,), read from their files."""
         return self._require_replay().gather(split, index, length)
 
     def decode(self, compact: Segments) -> SequenceBatch:
