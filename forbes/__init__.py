@@ -16,7 +16,7 @@ _PUBLIC = {
     "errors": "ForbesError",
     "evaluation": "CalibrationError ELBO PLL complete evaluate filter imagine",
     "models": "Bernoulli ConvDecoder ConvEncoder MLPDecoder MLPEncoder ModelParts Normal OneHot OnePixel "
-    "ParticleModel PixelDecoder PixelEncoder StateSpaceModel VectorModel VectorNormal",
+    "ParticleModel PixelDecoder PixelEncoder StateSpaceModel SymlogNormal VectorModel VectorNormal",
     "pomdps": "LightDark LinearGaussian MirrorSensor MountainHike TMaze Tiger Ungm",
     "training": "ImaginationActorCritic KnownBelief PlanningAgent WorldModel",
     "training.loading": "load_run",

@@ -39,6 +39,7 @@ from forbes.models import (
     PixelDecoder as PixelDecoder,
     PixelEncoder as PixelEncoder,
     StateSpaceModel as StateSpaceModel,
+    SymlogNormal as SymlogNormal,
     VectorModel as VectorModel,
     VectorNormal as VectorNormal,
 )

@@ -141,8 +141,8 @@ def described(value):
     if callable(value):
         options = getattr(value, "keywords", {})
         return {"class_path": getattr(value, "func", value).__name__} | ({"init_args": options} if options else {})
-    if isinstance(value, forbes.VectorNormal):
-        return {"class_path": "VectorNormal", "init_args": {"std": value.std}}
+    if isinstance(value, forbes.SymlogNormal | forbes.VectorNormal):
+        return {"class_path": type(value).__name__, "init_args": {"std": value.std}}
     return value if isinstance(value, int | float | str) else {"class_path": type(value).__name__}
 
 

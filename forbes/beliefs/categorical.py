@@ -1,4 +1,6 @@
-"""The categorical belief of DreamerV2 (Hafner et al., 2021, arXiv 2010.02193)."""
+"""The categorical belief of DreamerV2 (Hafner et al., 2021, arXiv 2010.02193) and DreamerV3 (arXiv 2301.04104)."""
+
+import math
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +14,8 @@ __all__ = ["CategoricalBelief", "draw_one_hot", "one_hot_of"]
 class CategoricalBelief(BeliefHead):
     r"""G independent one-hot variables of K classes each; s is their concatenation, of dimension D = G K.
 
-    .. math:: p(s \mid c) = \prod_{g=1}^G \prod_{k=1}^K \pi_{gk}(c)^{s_{gk}}, \qquad \pi_g = \mathrm{softmax}(\cdot)
+    .. math:: p(s \mid c) = \prod_{g=1}^G \prod_{k=1}^K \pi_{gk}(c)^{s_{gk}}, \qquad
+              \pi_g = (1 - m)\,\mathrm{softmax}(\cdot) + m / K
 
     This is a probability, not a density. Gradients are straight-through, :math:`\partial s := \partial \pi` (DreamerV2,
     algorithm 1). They are unbiased for functions that are linear in each variable, such as log p, and biased otherwise.
@@ -21,11 +24,14 @@ class CategoricalBelief(BeliefHead):
         state_dim: D, a multiple of `classes`; 1024 in DreamerV2.
         context_dim: C, the dimension of the context.
         classes: K; 32 as in DreamerV2.
-        kl_balance: :math:`\alpha` in [0, 1], weight of the prior's gradient in the closed-form KL; 0.8 in DreamerV2. By
-            default, prior and posterior both receive their full gradient.
+        kl_balance: :math:`\alpha` in [0, 1], weight of the prior's gradient in the closed-form KL, with
+            :math:`1 - \alpha` for the posterior's; 0.8 in DreamerV2. Or both weights, that of the prior first; 1 and
+            0.1 in DreamerV3. By default, prior and posterior both receive their full gradient.
+        uniform_mix: m in [0, 1), weight of the uniform distribution; 0.01 in DreamerV3. It bounds the KL by
+            :math:`G \log(K / m)` nats.
 
     Raises:
-        ForbesError: when `state_dim` is not a multiple of `classes`, or `kl_balance` is outside [0, 1].
+        ForbesError: when `state_dim` is not a multiple of `classes`, or a weight is outside its interval.
 
     Example:
         >>> belief = forbes.CategoricalBelief(state_dim=2, context_dim=8, classes=2)
@@ -36,19 +42,31 @@ class CategoricalBelief(BeliefHead):
 
     reparameterised = False
 
-    def __init__(self, state_dim: int, context_dim: int, classes: int = 32, kl_balance: float | None = None) -> None:
+    def __init__(
+        self,
+        state_dim: int,
+        context_dim: int,
+        classes: int = 32,
+        kl_balance: float | tuple[float, float] | None = None,
+        uniform_mix: float = 0.0,
+    ) -> None:
         super().__init__(state_dim, context_dim)
         if state_dim % classes:
             raise ForbesError(f"CategoricalBelief: state_dim is {state_dim}, expected a multiple of classes, {classes}")
-        if kl_balance is not None and not 0 <= kl_balance <= 1:
-            raise ForbesError(f"CategoricalBelief: kl_balance is {kl_balance}, expected 0 to 1. DreamerV2 has 0.8")
-        self.classes, self.kl_balance = classes, kl_balance
+        if not 0 <= uniform_mix < 1:
+            raise ForbesError(f"CategoricalBelief: uniform_mix is {uniform_mix}, expected 0 to below 1. Use 0.01")
+        self.classes, self.uniform_mix = classes, uniform_mix
+        self.kl_weights = _kl_weights(kl_balance)
         self.logits_of = nn.Linear(context_dim, state_dim)
 
     def log_probabilities(self, context: Tensor) -> Tensor:
         """Return log π, `(*, G, K)`."""
         variables: Tensor = self.logits_of(context).unflatten(-1, (-1, self.classes))  # (*, G, K)
-        return variables.log_softmax(-1)
+        log_softmax = variables.log_softmax(-1)
+        if not self.uniform_mix:
+            return log_softmax
+        uniform = log_softmax.new_full((), math.log(self.uniform_mix / self.classes))
+        return torch.logaddexp(log_softmax + math.log1p(-self.uniform_mix), uniform)
 
     def rsample(self, context: Tensor, sample_shape: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """See `BeliefHead.rsample`; the gradient is straight-through."""
@@ -64,19 +82,33 @@ class CategoricalBelief(BeliefHead):
         .. math:: \sum_{g,k} \pi_{gk} (\log \pi_{gk} - \log \pi^{prior}_{gk})
 
         With `kl_balance` its gradient is that of :math:`\alpha\, KL(\mathrm{sg}(q) \| p) +
-        (1 - \alpha)\, KL(q \| \mathrm{sg}(p))` (DreamerV2, algorithm 2); its value is unchanged.
+        \beta\, KL(q \| \mathrm{sg}(p))`, with :math:`\beta = 1 - \alpha` unless given (DreamerV2, algorithm 2;
+        DreamerV3, equation 4); its value is unchanged.
         """
         if not isinstance(prior, CategoricalBelief) or prior.classes != self.classes:
             return None
         ours, theirs = self.log_probabilities(context), prior.log_probabilities(prior_context)  # 2 x (*, G, K)
-        if self.kl_balance is not None:
-            ours, theirs = _scale_gradient(ours, 1 - self.kl_balance), _scale_gradient(theirs, self.kl_balance)
+        if self.kl_weights is not None:
+            of_prior, of_posterior = self.kl_weights
+            ours, theirs = _scale_gradient(ours, of_posterior), _scale_gradient(theirs, of_prior)
         return (ours.exp() * (ours - theirs)).sum((-2, -1))
 
 
 def one_hot_of(index: Tensor, like: Tensor) -> Tensor:
     """Return one-hot rows like `like`, `(*, K)`, of an index, `(*, 1)`; unlike `one_hot`, without reading values."""
     return torch.zeros_like(like).scatter(-1, index, 1.0)
+
+
+def _kl_weights(kl_balance: float | tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return the weights of the gradients of prior and posterior; None where both are 1."""
+    if kl_balance is None:
+        return None
+    of_prior, of_posterior = kl_balance if isinstance(kl_balance, tuple) else (kl_balance, 1 - kl_balance)
+    if not (0 <= of_prior <= 1 and 0 <= of_posterior <= 1):
+        raise ForbesError(
+            f"CategoricalBelief: kl_balance is {kl_balance}, expected 0 to 1. DreamerV2 has 0.8, DreamerV3 (1, 0.1)"
+        )
+    return of_prior, of_posterior
 
 
 def _scale_gradient(x: Tensor, factor: float) -> Tensor:

@@ -2,7 +2,7 @@
 
 from forbes.models.base import BeliefModel, EncodedSequence, ModelFamily, ModelParts, Rollout, State
 from forbes.models.elbo import ElboTerms, elbo_loss
-from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, OnePixel, VectorNormal
+from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, OnePixel, SymlogNormal, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
 from forbes.models.particles import ParticleModel
 from forbes.models.pixels import PixelDecoder, PixelEncoder
@@ -31,6 +31,7 @@ __all__ = [
     "Rollout",
     "State",
     "StateSpaceModel",
+    "SymlogNormal",
     "VectorModel",
     "VectorNormal",
     "elbo_loss",

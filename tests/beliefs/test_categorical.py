@@ -1,5 +1,8 @@
 """The categorical belief against torch.distributions."""
 
+import math
+import re
+
 import pytest
 import torch
 from torch.distributions import Independent, OneHotCategorical, kl_divergence
@@ -63,9 +66,10 @@ def test_monte_carlo_kl_has_the_mean_gradient_of_the_closed_form():
     assert ((gradients.mean(0) - expected).abs() < 4 * gradients.std(0) / number**0.5).all()
 
 
-@pytest.mark.parametrize("balance", [0.0, 0.5, 0.8, 1.0])
+@pytest.mark.parametrize("balance", [0.0, 0.5, 0.8, 1.0, (1.0, 0.1), (0.5, 0.0)])
 def test_balanced_kl_has_the_gradient_of_the_two_stopped_kls(balance):
-    """DreamerV2's definition, spelled out with torch.distributions."""
+    """The definitions of DreamerV2 and DreamerV3, spelled out with torch.distributions."""
+    of_prior, of_posterior = balance if isinstance(balance, tuple) else (balance, 1 - balance)
     plain, prior = head(seed=0), head(seed=1)
     balanced = CategoricalBelief(12, CONTEXT, 4, kl_balance=balance).double()
     balanced.load_state_dict(plain.state_dict())
@@ -75,9 +79,9 @@ def test_balanced_kl_has_the_gradient_of_the_two_stopped_kls(balance):
     def stopped(belief, at):
         return Independent(OneHotCategorical(logits=oracle(belief, at).base_dist.logits.detach()), 1)
 
-    expected = balance * kl_divergence(stopped(balanced, context), oracle(prior, prior_context)) + (
-        1 - balance
-    ) * kl_divergence(oracle(balanced, context), stopped(prior, prior_context))
+    expected = of_prior * kl_divergence(
+        stopped(balanced, context), oracle(prior, prior_context)
+    ) + of_posterior * kl_divergence(oracle(balanced, context), stopped(prior, prior_context))
     kl = balanced.kl(context, prior, prior_context)
 
     torch.testing.assert_close(kl, plain.kl(context, prior, prior_context))
@@ -89,10 +93,39 @@ def test_balanced_kl_has_the_gradient_of_the_two_stopped_kls(balance):
         torch.testing.assert_close(ours, torch.zeros_like(ours) if theirs is None else theirs)
 
 
-@pytest.mark.parametrize("balance", [-0.1, 1.1, float("nan")])
+@pytest.mark.parametrize("balance", [-0.1, 1.1, float("nan"), (1.0, -0.1)])
 def test_refuses_a_balance_outside_0_to_1(balance):
-    with pytest.raises(ForbesError, match=f"kl_balance is {balance}, expected 0 to 1"):
+    with pytest.raises(ForbesError, match=re.escape(f"kl_balance is {balance}, expected 0 to 1")):
         CategoricalBelief(12, CONTEXT, 4, kl_balance=balance)
+
+
+@pytest.mark.parametrize("mix", [0.01, 0.5])
+def test_a_uniform_mix_is_that_of_the_probabilities(mix):
+    belief, context = CategoricalBelief(12, CONTEXT, 4, uniform_mix=mix).double(), contexts(5)
+
+    mixed = (1 - mix) * belief.logits_of(context).unflatten(-1, (3, 4)).softmax(-1) + mix / 4
+
+    torch.testing.assert_close(belief.log_probabilities(context).exp(), mixed)
+
+
+def test_a_uniform_mix_bounds_the_kl():
+    """A certain posterior meets a prior that is certain of another class: about log(K / m) nats per variable."""
+    posterior, prior = (CategoricalBelief(12, CONTEXT, 4, uniform_mix=0.01).double() for _ in range(2))
+    for belief, favourite in ((posterior, 0), (prior, 1)):
+        torch.nn.init.zeros_(belief.logits_of.weight)
+        certain = torch.full((3, 4), -1e4).index_fill(1, torch.tensor(favourite), 1e4).flatten()
+        belief.logits_of.bias.data = certain.double()
+
+    kl = posterior.kl(contexts(5), prior, contexts(5))
+
+    assert (kl < 3 * math.log(4 / 0.01)).all()
+    assert (kl > 3 * 0.98 * math.log(4 / 0.01)).all()
+
+
+@pytest.mark.parametrize("mix", [-0.1, 1.0, float("nan")])
+def test_refuses_a_mix_that_leaves_nothing(mix):
+    with pytest.raises(ForbesError, match=f"uniform_mix is {mix}, expected 0 to below 1"):
+        CategoricalBelief(12, CONTEXT, 4, uniform_mix=mix)
 
 
 def test_other_families_or_classes_have_no_closed_form():

@@ -5,7 +5,8 @@ import torch
 from torch import distributions
 
 from forbes.errors import ForbesError
-from forbes.models import Bernoulli, Normal, OneHot, OnePixel, VectorNormal
+from forbes.models import Bernoulli, Normal, OneHot, OnePixel, SymlogNormal, VectorNormal
+from forbes.symlog import symlog
 
 SHAPE = (5, 3, 2, 4, 4)  # (B, T, C, H, W)
 
@@ -155,6 +156,17 @@ def test_vector_normal_is_that_of_torch_distributions():
     expected = distributions.Normal(vectors(), 0.3).log_prob(vectors().flip(0)).sum(-1)
 
     torch.testing.assert_close(VectorNormal(0.3).log_prob(vectors(), vectors().flip(0)), expected)
+
+
+def test_symlog_normal_is_a_density_of_the_observation():
+    """Over x in [-e^8, e^8], beyond which symlog x is 8 σ away: the sum over a fine grid in the units of x is 1."""
+    likelihood, grid = SymlogNormal(), torch.linspace(-8, 8, 16_001).double()
+    x = grid.sign() * grid.abs().expm1()  # dense where the density is, (16001,)
+
+    density = likelihood.log_prob(torch.full((1,), -0.7).double(), symlog(x)[:, None]).exp()
+
+    assert abs(torch.trapezoid(density, x) - 1) < 1e-4
+    assert likelihood.target(torch.tensor([torch.e - 1, 0.0, 1 - torch.e])).tolist() == pytest.approx([1, 0, -1])
 
 
 def test_one_hot_is_the_categorical_of_torch_distributions():
