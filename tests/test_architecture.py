@@ -21,7 +21,7 @@ FOUNDATION = [
     "named",
     "rounding",
 ]
-FOUNDATION += ["seeding", "shapes", "signatures"]
+FOUNDATION += ["seeding", "shapes", "signatures", "symlog"]
 PACKAGES = ["performance", "beliefs", "models", "control", "pomdps", "envs", "data", "runs", "training", "evaluation"]
 PACKAGES += ["figures", "callbacks", "commands"]
 LINE = [*FOUNDATION, *PACKAGES, "__main__", "__init__"]
