@@ -20,6 +20,7 @@ FOUNDATION = [
     "frozen",
     "named",
     "rounding",
+    "distributed",
 ]
 FOUNDATION += ["seeding", "shapes", "signatures", "symlog"]
 PACKAGES = ["performance", "beliefs", "models", "control", "pomdps", "envs", "data", "runs", "training", "evaluation"]

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from forbes.control.policy import Actor, Policy, ScalarHead
+from forbes.distributed import masked_sums
 from forbes.frozen import frozen
 from forbes.models import Filtered, State, StateSpaceModel
 from forbes.performance.fusion import fused
@@ -217,4 +218,5 @@ def _discounted_mean(values: Tensor, discount: Tensor, valid: Tensor) -> Tensor:
     """Average over trajectories and states. The weight of a state is the product of the discounts before it."""
     first = torch.ones_like(discount[..., :1])
     weight = torch.cat((first, discount.detach()[..., :-2]), -1).cumprod(-1)  # (*, H - 1)
-    return ((weight * values).mean(-1) * valid).sum() / valid.sum()
+    total, count = masked_sums((weight * values).mean(-1), valid)
+    return total / count

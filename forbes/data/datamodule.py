@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch, check_source
-from forbes.errors import require_at_least
+from forbes.distributed import num_ranks, rank
+from forbes.errors import ForbesError, require_at_least
 
 __all__ = ["SequenceDataModule", "datamodule_of"]
 
@@ -37,10 +38,24 @@ class _TrainIndices:
     def __iter__(self) -> Iterator[Tensor]:
         trainer = self.datamodule.trainer
         first = _batches_taken(trainer) if trainer is not None else 0
-        return (self.datamodule.train_index(number) for number in range(first, first + len(self)))
+        return (_share(self.datamodule.train_index(number)) for number in range(first, first + len(self)))
 
     def __len__(self) -> int:
         return self.datamodule.updates_per_epoch
+
+
+def _share(index: Tensor) -> Tensor:
+    """Return the part of a training batch, `(B,)`, that belongs to this rank, `(B / R,)`.
+
+    Raises:
+        ForbesError: if the ranks do not divide the batch.
+    """
+    if len(index) % num_ranks():
+        raise ForbesError(
+            f"SequenceDataModule: batch_size is {len(index)}, expected a multiple of {num_ranks()}, the number of "
+            "processes that share each batch. Choose another"
+        )
+    return index.reshape(num_ranks(), -1)[rank()]  # (B / R,)
 
 
 def _batches_taken(trainer: Trainer) -> int:
@@ -59,7 +74,8 @@ class SequenceDataModule(LightningDataModule):
     """Batches of `SequenceBatch` from a source; images stay uint8 until they are on the device.
 
     Training batch i is a pure function of (seed, i). A resumed run continues with the batch it would have had, and no
-    loader or RNG state is stored. An epoch is a number of updates, not a pass over the data.
+    loader or RNG state is stored. An epoch is a number of updates, not a pass over the data. The R processes of one
+    training share every batch: rank r has the rows from r B / R on. They share the batches of the other splits out.
 
     Args:
         source: source of the sequences, e.g. `Strokes`.
@@ -154,7 +170,9 @@ class SequenceDataModule(LightningDataModule):
 
     def _ordered(self, split: Split, limit: int | None) -> DataLoader[Any]:
         size = self.source.size(split)
-        return self._loader(split, torch.arange(min(limit or size, size)).split(4 * self.batch_size))
+        batches = torch.arange(min(limit or size, size)).split(4 * self.batch_size)
+        # Lightning leaves the loop out on a rank that has no batch, and the others would wait for it.
+        return self._loader(split, batches[rank() :: num_ranks()] or [torch.arange(0)])
 
     def _loader(self, split: Split, indices: Any) -> DataLoader[Any]:
         # No workers: gathering a batch takes less time than its transfer from a worker process.

@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
+from forbes.distributed import masked_sums
 from forbes.shapes import printed_by_shape
 
 __all__ = ["KL", "ElboTerms", "FreeNats", "elbo_loss"]
@@ -45,7 +46,8 @@ class ElboTerms(NamedTuple):
 
     def mean_over_steps(self, values: Tensor) -> Tensor:
         """Average `(B, T)` over the steps that count."""
-        return (values * self.mask).sum() / self.mask.sum()
+        total, count = masked_sums(values, self.mask)
+        return total / count
 
 
 def elbo_loss(

@@ -15,6 +15,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from forbes.distributed import masked_sums
 from forbes.errors import ForbesError, require_at_least
 from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
@@ -135,4 +136,5 @@ class VectorModel(BeliefModel):
         begin = State(hidden[row, start], self.nothing.expand(batch, -1))
         features = self.imagine(begin, encoded.action[rows, inside]).features  # (B, L, H)
         log_likelihood = self.log_likelihood(features, encoded.target[rows, inside])
-        return -(log_likelihood * counts).sum() / counts.sum().clamp(min=1)
+        total, count = masked_sums(log_likelihood, counts)
+        return -total / count.clamp(min=1)

@@ -8,6 +8,7 @@ from torch.optim import Optimizer
 
 from forbes.beliefs import BeliefFamily
 from forbes.data import SequenceBatch, SequenceDataModule, Simulated
+from forbes.distributed import mean_over_ranks, shared_batch
 from forbes.errors import ForbesError
 from forbes.models.elbo import elbo_loss
 from forbes.models.known_model import KnownModel, Standardizer
@@ -112,13 +113,14 @@ class KnownBelief(SeededModule):
     def loss(self, batch: SequenceBatch) -> Tensor:
         """Return the objective in nats per step, a scalar."""
         if self.objective == "state_nll":
-            return self.state_nll(batch).mean()
+            return mean_over_ranks(self.state_nll(batch).mean())
         with full_precision(batch.state):
             return elbo_loss(self.model.elbo(batch.observation, batch.action, batch.mask))
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Return and log the loss of one update."""
-        loss = self.loss(batch)
+        with shared_batch():
+            loss = self.loss(batch)
         self.log_split("train", {"loss": loss.detach()}, batch)
         return loss
 

@@ -11,6 +11,7 @@ from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from forbes.data import SequenceBatch
+from forbes.distributed import WeightedMeans, num_ranks, rank
 from forbes.seeding import derive_seed
 from forbes.training.divergence import hold_unless_finite
 
@@ -30,8 +31,8 @@ class Group(NamedTuple):
 class SeededModule(LightningModule, ABC):
     r"""A LightningModule whose training is a function of its seed, also when it is interrupted and resumed.
 
-    The noise of an update depends on the seed and the number of the update, that of a validation on the seed. The
-    learning rate of Adam in update n of N is
+    The noise of an update depends on the seed, the number of the update and the rank, that of a validation on the seed
+    alone. The learning rate of Adam in update n of N is
 
     .. math:: \min(1, \tfrac{n + 1}{\mathrm{warmup}})\,\mathrm{rate} \quad\text{and with a cosine times}\quad
               \tfrac12 (1 + \cos \tfrac{\pi n}{N})
@@ -90,19 +91,47 @@ class SeededModule(LightningModule, ABC):
 
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
         """Seed the noise of this batch, so that a resumed run draws the same."""
-        torch.manual_seed(derive_seed(self.seed, "update", self.batches_before))
+        self.seed_update(rank())
+
+    def seed_update(self, of_rank: int) -> None:
+        """Seed the noise of a rank's share of the current batch."""
+        purpose = f"update/{of_rank}" if of_rank else "update"
+        torch.manual_seed(derive_seed(self.seed, purpose, self.batches_before))
 
     def on_validation_epoch_start(self) -> None:
-        """Seed the noise of a validation, the same each time."""
-        torch.manual_seed(derive_seed(self.seed, "validation", 0))
+        """Begin the means of a validation."""
+        self._means = WeightedMeans()
 
     def validation_step(self, batch: SequenceBatch, batch_idx: int) -> None:
-        """Log `measure` of the validation split."""
-        self.log_split("val", self.measure(batch), batch)
+        """Add `measure` of a batch of the validation split."""
+        self._add("validation", batch, batch_idx)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the means of the validation split."""
+        self._log_means("val")
+
+    def on_test_epoch_start(self) -> None:
+        """Begin the means of a test."""
+        self._means = WeightedMeans()
 
     def test_step(self, batch: SequenceBatch, batch_idx: int) -> None:
-        """Log `measure` of the test split. `forbes evaluate` and `forbes beliefs` measure more carefully."""
-        self.log_split("test", self.measure(batch), batch)
+        """Add `measure` of a batch of the test split. `forbes evaluate` and `forbes beliefs` measure more carefully."""
+        self._add("test", batch, batch_idx)
+
+    def on_test_epoch_end(self) -> None:
+        """Log the means of the test split."""
+        self._log_means("test")
+
+    def _add(self, split: str, batch: SequenceBatch, batch_idx: int) -> None:
+        """Measure a batch with the noise of its number in the split, of which rank r of R has r, r + R, ..."""
+        if len(batch.mask) == 0:  # of a rank for which there is none
+            return
+        torch.manual_seed(derive_seed(self.seed, split, batch_idx * num_ranks() + rank()))
+        self._means.add(self.measure(batch), len(batch.mask))
+
+    def _log_means(self, split: str) -> None:
+        """Log the means over all batches of all ranks."""
+        self.log_dict({f"{split}/{name}": value for name, value in self._means.compute().items()})
 
     def log_split(self, split: str, values: dict[str, Tensor], batch: SequenceBatch) -> None:
         """Log scalars of a batch by name, as `train/name`."""

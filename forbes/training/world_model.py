@@ -11,6 +11,7 @@ from torch.optim import Optimizer
 
 from forbes.beliefs import BeliefFamily, FlowBelief
 from forbes.data import SequenceBatch, SequenceDataModule
+from forbes.distributed import means_over_ranks, shared_batch, sum_over_ranks
 from forbes.errors import require_at_least
 from forbes.models.base import ModelFamily, ModelParts
 from forbes.models.elbo import KL, ElboTerms, FreeNats, elbo_loss
@@ -194,13 +195,16 @@ class WorldModel(SeededModule):
         if batch_idx == 0:
             self.model.likelihood.check(batch.observation)
         if self.model.center is not None and self.batches_before == 0:
-            self.model.center.copy_(self.model.likelihood.target(batch.observation)[batch.mask].mean(0))  # (*O)
+            observed = self.model.likelihood.target(batch.observation)[batch.mask]  # (N, *O)
+            with shared_batch():
+                self.model.center.copy_(sum_over_ranks(observed.sum(0)) / sum_over_ranks(batch.mask.sum()))  # (*O)
 
     def training_step(self, batch: SequenceBatch, batch_idx: int) -> Tensor:
         """Return the loss of one update, and log what comes with it."""
-        term = (self.recorded or self.total_loss)(batch)
-        self.log_split("train", term.logs, batch)
-        return term.loss
+        with shared_batch():
+            loss, logs = (self.recorded or self.total_loss)(batch)
+            self.log_split("train", means_over_ranks(logs), batch)
+        return loss
 
     def total_loss(self, batch: SequenceBatch) -> LossTerm:
         """Return the loss of one update, the sum of its terms."""
