@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from forbes.control.policy import Actor, Policy, ScalarHead
+from forbes.control.return_scale import ReturnScale
 from forbes.distributed import masked_sums
 from forbes.frozen import frozen
 from forbes.models import Filtered, State, StateSpaceModel
@@ -29,6 +30,7 @@ from forbes.performance.precision import full_precision
 from forbes.shapes import printed_by_shape
 
 __all__ = [
+    "ActorCritic",
     "Imagined",
     "ImaginedWorld",
     "actor_critic_losses",
@@ -56,6 +58,19 @@ class ImaginedWorld(NamedTuple):
         return discount * continues
 
 
+class ActorCritic(NamedTuple):
+    """What learns in imagination. The last two are DreamerV3's (arXiv 2301.04104)."""
+
+    actor: Actor
+    """The policy π."""
+    critic: ScalarHead
+    """The value v of features."""
+    slow_critic: ScalarHead | None = None
+    """A moving average of the critic, to which the critic is held."""
+    return_scale: ReturnScale | None = None
+    """By which the returns are divided in the actor's loss."""
+
+
 @printed_by_shape
 class Imagined(NamedTuple):
     """M imagined trajectories of H states."""
@@ -68,8 +83,7 @@ class Imagined(NamedTuple):
 
 def actor_critic_losses(
     world: ImaginedWorld,
-    actor: Actor,
-    critic: ScalarHead,
+    learner: ActorCritic,
     filtered: Filtered,
     start_mask: Tensor,
     *,
@@ -83,15 +97,15 @@ def actor_critic_losses(
 
     .. math::
 
-        L_{actor} = -\overline{w_\tau (V_\tau - \eta \log \pi(a_{\tau-1}))}, \qquad
-        L_{critic} = \overline{w_\tau \tfrac12 (v(f_\tau) - \mathrm{sg}(V_\tau))^2}
+        L_{actor} = -\overline{w_\tau (V_\tau / S - \eta \log \pi(a_{\tau-1}))}, \qquad
+        L_{critic} = \overline{w_\tau [E(v(f_\tau), \mathrm{sg}(V_\tau)) + E(v(f_\tau), v_{slow}(f_\tau))]}
 
-    Each loss has gradients with respect to its own network only.
+    E is the critic's error, half the square of the difference for a `ScalarHead`. S is 1 without a `return_scale`, and
+    the last term is only there with a `slow_critic`. Each loss has gradients with respect to its own network only.
 
     Args:
         world: model, rewards and ends of episodes; it is not trained here.
-        actor: the policy π.
-        critic: the value v of features.
+        learner: actor and critic.
         filtered: the beliefs along B sequences of T steps.
         start_mask: which of them an imagined trajectory starts from, bool `(B, T)`. The others do not count.
         trajectories: samples of each belief, N.
@@ -101,20 +115,25 @@ def actor_critic_losses(
         actor_entropy: :math:`\eta`, the reward of a nat of the policy's entropy.
 
     Returns:
-        The actor's loss in units of reward and the critic's in its square, scalars.
+        The actor's loss in units of reward, or of S, and the critic's in those of its error, scalars.
     """
     start = State(*(values.flatten(0, 2) for values in sample_starts(world.model, filtered, trajectories)))
     valid = start_mask.expand(trajectories, -1, -1).flatten()  # (M,), M = N B T
 
     # Gradients pass through the world and the critic to the actions, and train neither.
-    with frozen(*filter(None, world), critic):
-        imagined = imagine(world.model, actor, start, horizon)
+    with frozen(*filter(None, world), learner.critic):
+        imagined = imagine(world.model, learner.actor, start, horizon)
         discounts = world.discount(imagined.features, discount)  # (M, H) or (H,)
-        reward, target = world.reward(imagined.features), critic(imagined.features)  # 2 x (M, H)
+        reward, target = world.reward(imagined.features), learner.critic(imagined.features)  # 2 x (M, H)
         returns = lambda_returns(reward, target, discounts, lambda_)  # (M, H - 1)
 
-    value = critic(imagined.features[:, :-1].detach())  # (M, H - 1)
-    loss_of_critic = critic_loss(value, returns, discounts, valid)
+    seen = imagined.features[:, :-1].detach()  # (M, H - 1, F)
+    error = learner.critic.error(seen, returns.detach())  # (M, H - 1)
+    if learner.slow_critic is not None:
+        error = error + learner.critic.error(seen, learner.slow_critic(seen).detach())  # (M, H - 1)
+    loss_of_critic = critic_loss(error, discounts, valid)
+    if learner.return_scale is not None:
+        returns = returns / learner.return_scale(returns, valid)  # (M, H - 1)
     if actor_entropy:  # a gradient of zeros would cost 3 % of the imagination
         returns = returns - actor_entropy * imagined.log_prob[:, :-1]  # (M, H - 1)
     return actor_loss(returns, discounts, valid), loss_of_critic
@@ -201,16 +220,15 @@ def actor_loss(returns: Tensor, discount: Tensor, valid: Tensor) -> Tensor:
     return -_discounted_mean(returns, discount, valid)
 
 
-def critic_loss(value: Tensor, returns: Tensor, discount: Tensor, valid: Tensor) -> Tensor:
-    r"""Return :math:`\overline{w_\tau \tfrac12 (v_\tau - \mathrm{sg}(V_\tau))^2}` (paper, J_Critic).
+def critic_loss(error: Tensor, discount: Tensor, valid: Tensor) -> Tensor:
+    r"""Return :math:`\overline{w_\tau E_\tau}`; in the paper, :math:`E = \tfrac12 (v_\tau - \mathrm{sg}(V_\tau))^2`.
 
     Args:
-        value: :math:`v(s_\tau)` of the states that have a return, `(*, H - 1)`.
-        returns: :math:`V_\tau`, `(*, H - 1)`. They have no gradient.
+        error: E of the values of the states that have a return, `(*, H - 1)`; see `ScalarHead.error`.
         discount: as for `actor_loss`.
         valid: as for `actor_loss`.
     """
-    return _discounted_mean(0.5 * (value - returns.detach()).square(), discount, valid)
+    return _discounted_mean(error, discount, valid)
 
 
 @fused

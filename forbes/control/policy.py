@@ -10,8 +10,9 @@ from torch.nn.functional import softplus
 from forbes.beliefs.categorical import draw_one_hot, one_hot_of
 from forbes.models.networks import MLP
 from forbes.performance.fusion import fused
+from forbes.symlog import symexp, two_hot
 
-__all__ = ["Actor", "OneHotCategorical", "Policy", "ScalarHead", "TanhNormal"]
+__all__ = ["Actor", "OneHotCategorical", "Policy", "ScalarHead", "TanhNormal", "TwoHotHead"]
 
 _MODE_SAMPLES = 100
 _LOG_2 = math.log(2.0)
@@ -146,3 +147,61 @@ class ScalarHead(nn.Module):
         """Return the scalar, `(*, F)` to `(*)`."""
         number: Tensor = self.net(features).to(features.dtype)
         return number.squeeze(-1)  # (*)
+
+    def error(self, features: Tensor, target: Tensor) -> Tensor:
+        r"""Return :math:`\tfrac12 (v(f) - x)^2`, `(*)`: but for a constant, the nats of x under N(v(f), 1).
+
+        Args:
+            features: f, `(*, F)`.
+            target: x, `(*)`.
+        """
+        return 0.5 * (self(features) - target).square()
+
+
+class TwoHotHead(ScalarHead):
+    r"""A scalar as the mean of a categorical over K fixed bins (DreamerV3, Hafner et al., arXiv 2301.04104).
+
+    .. math:: v(f) = \sum_k \pi_k(f)\, b_k, \qquad b_k = \mathrm{symexp}\left(-20 + \tfrac{40\,(k - 1)}{K - 1}\right)
+
+    It is trained by the cross-entropy with the two-hot code of the target, whose gradient does not grow with the
+    target's scale. At first all bins are equally probable, so v = 0.
+
+    Args:
+        feature_dim: dimensions of the features, F.
+        width: width of each hidden layer.
+        layers: number of hidden layers.
+        bins: K, odd; 255 in DreamerV3.
+    """
+
+    bins: Tensor
+
+    def __init__(self, feature_dim: int, width: int, layers: int, bins: int = 255) -> None:
+        super().__init__(feature_dim, width, layers)
+        self.net[1] = last = nn.Linear(width, bins)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        half = symexp(torch.linspace(0, 20, bins // 2 + 1))
+        self.register_buffer("bins", torch.cat((-half.flip(0)[:-1], half)), persistent=False)  # (K,)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return v, `(*, F)` to `(*)`.
+
+        Each bin is paired with its negative: in a plain sum, terms of up to 5e8 would have to cancel.
+        """
+        probability = self._logits(features).softmax(-1)  # (*, K)
+        more = probability - probability.flip(-1)  # (*, K), of a bin than of its negative
+        half = self.bins.shape[0] // 2
+        return (more * self.bins)[..., half + 1 :].sum(-1)  # (*)
+
+    def error(self, features: Tensor, target: Tensor) -> Tensor:
+        r"""Return :math:`-\sum_k w_k(x) \log \pi_k(f)` in nats, `(*)`, with the two-hot code w of x.
+
+        Args:
+            features: f, `(*, F)`.
+            target: x, `(*)`; it has no gradient.
+        """
+        return -(two_hot(target.detach(), self.bins) * self._logits(features).log_softmax(-1)).sum(-1)
+
+    def _logits(self, features: Tensor) -> Tensor:
+        logits: Tensor = self.net(features).to(features.dtype)
+        return logits  # (*, K)

@@ -6,13 +6,13 @@ from itertools import chain, pairwise
 from typing import Literal, TypeAlias
 
 from torch import Tensor, nn
-from torch.nn.functional import elu, relu
+from torch.nn.functional import elu, layer_norm, relu, silu
 
 from forbes.configured import Configurable
 from forbes.errors import ForbesError
 from forbes.performance.convolutions import convolve
-from forbes.performance.fusion import Elementwise
-from forbes.performance.recurrence import prepare_mlp
+from forbes.performance.fusion import Elementwise, fused
+from forbes.performance.recurrence import Layer, prepare_mlp
 from forbes.performance.time_loop import TimeLoop
 
 __all__ = [
@@ -23,15 +23,49 @@ __all__ = [
     "Encoder",
     "MLPDecoder",
     "MLPEncoder",
+    "NormSiLU",
     "activate",
     "transposed_kernels",
 ]
 
-Activation: TypeAlias = Literal["relu", "elu"]
-_ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU}
-_FUNCTIONS: dict[type[nn.Module], Elementwise] = {nn.ReLU: relu, nn.ELU: elu}
+Activation: TypeAlias = Literal["relu", "elu", "silu", "norm_silu"]
 _KERNEL = 4
 """Side of the encoder's kernels in pixels."""
+_NORM_EPS = 1e-3
+"""DreamerV3's."""
+
+
+@fused
+def norm_silu(y: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Return the SiLU of the layer norm of each row, `(*, W)`."""
+    return silu(layer_norm(y, weight.shape, weight, bias, _NORM_EPS))
+
+
+class NormSiLU(nn.LayerNorm):
+    r"""A layer norm and a SiLU, what follows a linear layer in DreamerV3 (arXiv 2301.04104).
+
+    .. math:: \mathrm{silu}\left(\gamma \odot \frac{y - \bar y}{\sqrt{\mathrm{var}(y) + \epsilon}} + \beta\right),
+              \qquad \mathrm{silu}(x) = x\,\sigma(x)
+
+    Args:
+        width: dimensions of y.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__(width, eps=_NORM_EPS)
+
+    def forward(self, y: Tensor) -> Tensor:
+        """Return the activation of rows, `(*, W)`."""
+        return norm_silu(y, self.weight, self.bias)
+
+
+_ACTIVATIONS: dict[Activation, Callable[[int], nn.Module]] = {
+    "relu": lambda width: nn.ReLU(),
+    "elu": lambda width: nn.ELU(),
+    "silu": lambda width: nn.SiLU(),
+    "norm_silu": NormSiLU,
+}
+_FUNCTIONS: dict[type[nn.Module], Elementwise] = {nn.ReLU: relu, nn.ELU: elu, nn.SiLU: silu, NormSiLU: norm_silu}
 
 
 class MLP(nn.Sequential):
@@ -41,19 +75,11 @@ class MLP(nn.Sequential):
         dims = [input_dim] + [width] * layers
         super().__init__(*(nn.Sequential(nn.Linear(a, b), nn.ReLU()) for a, b in pairwise(dims)))
 
-    @property
-    def linear(self) -> list[nn.Linear]:
-        """The linear layers alone."""
-        return [layer for layer in self.modules() if isinstance(layer, nn.Linear)]
-
-    @property
-    def activation(self) -> Elementwise:
-        """The function that follows each of them."""
-        return _FUNCTIONS[type(self.get_submodule("0.1"))]
-
     def prepare(self, known: Tensor, loop: TimeLoop) -> Callable[[Tensor], Tensor]:
         """Return the network of [x, known] as a function of x, for the steps of a loop (see `prepare_mlp`)."""
-        return prepare_mlp(self.linear, self.activation, known, loop)
+        pairs = [(block.get_submodule("0"), block.get_submodule("1")) for block in self.children()]
+        layers = [Layer(a.weight, a.bias, _FUNCTIONS[type(b)], tuple(b.parameters())) for a, b in pairs]
+        return prepare_mlp(layers, known, loop)
 
 
 def activate(module: nn.Module, activation: Activation) -> None:
@@ -61,7 +87,7 @@ def activate(module: nn.Module, activation: Activation) -> None:
     for part in module.modules():
         if isinstance(part, MLP):
             for block in part.children():
-                block.add_module("1", _ACTIVATIONS[activation]())
+                block.add_module("1", _ACTIVATIONS[activation](block.get_submodule("0").out_features))
 
 
 class Encoder(Configurable, nn.Module):

@@ -1,6 +1,7 @@
 """The networks of a filter in a time loop: a GRU cell, and an MLP part of whose input is known before the loop."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -9,20 +10,30 @@ from torch.nn.functional import linear
 from forbes.performance.fusion import Elementwise, fused
 from forbes.performance.time_loop import TimeLoop
 
-__all__ = ["prepare_gru", "prepare_mlp"]
+__all__ = ["Layer", "prepare_gru", "prepare_mlp"]
 
 
-def prepare_mlp(
-    layers: Sequence[nn.Linear], activation: Elementwise, known: Tensor, loop: TimeLoop
-) -> Callable[[Tensor], Tensor]:
+class Layer(NamedTuple):
+    """A linear layer and what follows it."""
+
+    weight: Tensor
+    """`(out, in)`."""
+    bias: Tensor
+    """`(out,)`."""
+    activation: Elementwise
+    """Function of the linear layer's output, `(B, out)`, and of `more`."""
+    more: tuple[Tensor, ...] = ()
+    """Parameters of the activation, such as those of a norm."""
+
+
+def prepare_mlp(layers: Sequence[Layer], known: Tensor, loop: TimeLoop) -> Callable[[Tensor], Tensor]:
     r"""Prepare an MLP of [x, k] for a loop over x, where k is known for all steps.
 
     The first layer is split, :math:`W [x_t, k_t] + b = W_x x_t + (W_k k_t + b)`, and the term in brackets is one matrix
     product over all steps, before the loop.
 
     Args:
-        layers: the linear layers, each followed by the activation.
-        activation: elementwise function.
+        layers: the layers in order.
         known: k_t, the last inputs of the network, `(B, T, K)`.
         loop: its batch is N copies of these B sequences.
 
@@ -30,15 +41,15 @@ def prepare_mlp(
         The MLP's output in one step, x `(N B, X)` to `(N B, width)`.
     """
     first, *others = layers
-    weight_x, weight_known = first.weight.split((first.in_features - known.shape[-1], known.shape[-1]), 1)
+    weight_x, weight_known = first.weight.tensor_split([first.weight.shape[1] - known.shape[-1]], 1)
     term = linear(known.transpose(0, 1), weight_known, first.bias)  # (T, B, M)
     terms = term[:, None].expand(-1, loop.batch // len(known), -1, -1).flatten(1, 2)  # (T, N B, M)
-    bound = [loop.linear(weight_x, terms, activation)]
-    bound += [loop.linear(layer.weight, layer.bias, activation) for layer in others]
+    bound = [loop.linear(weight_x, terms, first.activation)]
+    bound += [loop.linear(layer.weight, layer.bias, layer.activation) for layer in others]
 
     def run(x: Tensor) -> Tensor:
-        for layer in bound:
-            x = layer(x)
+        for bound_linear, layer in zip(bound, layers, strict=True):
+            x = bound_linear(x, *layer.more)
         return x
 
     return run

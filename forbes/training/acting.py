@@ -9,7 +9,7 @@ from typing import Any, Self
 from torch import Tensor
 
 from forbes.control.agent import ActionSelector, Agent
-from forbes.control.policy import ScalarHead
+from forbes.control.policy import ScalarHead, TwoHotHead
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.data.episodes.collection import episode_seed, play_whole
 from forbes.data.episodes.episode import Episode
@@ -28,10 +28,14 @@ class WorldModelAgent(WorldModel, ABC):
 
     .. math:: L_{model} = -J_{Model} - \overline{\log p(r_t \mid f_t)}
 
+    With `two_hot`, :math:`\log p(r_t \mid f_t)` is that of the reward's two-hot code (`TwoHotHead`), a probability, and
+    not a density.
+
     Args:
         control_dim: width of the MLPs of reward, actor and critic.
         reward_layers: hidden layers of the reward's MLP.
         reward_std: :math:`\sigma_r`; values below 1 weight the reward more. PlaNet's scale of 10 is 0.32.
+        two_hot: predict rewards, and values, by a categorical over fixed bins (DreamerV3), for any scale of them.
         exploration: standard deviation of the noise on the actions of collected episodes; for discrete actions the
             probability of a uniformly random one.
         discrete: whether an action is one of A, one-hot; the command line takes it from the data.
@@ -49,6 +53,7 @@ class WorldModelAgent(WorldModel, ABC):
         control_dim: int = 200,
         reward_layers: int = 2,
         reward_std: float = 1.0,
+        two_hot: bool = False,
         exploration: float = 0.3,
         discrete: bool = False,
         acting_samples: int = 1,
@@ -60,6 +65,8 @@ class WorldModelAgent(WorldModel, ABC):
         require_at_least(0, name, exploration=exploration)
         if not reward_std > 0:
             raise ForbesError(f"{name}: reward_std is {reward_std}, expected a number above 0. 1 is Dreamer's")
+        if two_hot and reward_std != 1:
+            raise ForbesError(f"{name}: reward_std is {reward_std} with two_hot, which has none. Leave one of them out")
         if type(self.model) is not StateSpaceModel:
             raise ForbesError(
                 f"{name}: its model is a {type(self.model).__name__}, expected a StateSpaceModel. Name none"
@@ -71,7 +78,8 @@ class WorldModelAgent(WorldModel, ABC):
             )
         self.exploration, self.discrete, self.acting_samples = exploration, discrete, acting_samples
         self.reward_std, self.reward_layers = reward_std, reward_layers
-        self.reward = ScalarHead(self.model.hidden_dim + self.model.state_dim, control_dim, reward_layers)
+        self.scalar_head = TwoHotHead if two_hot else ScalarHead
+        self.reward = self.scalar_head(self.model.hidden_dim + self.model.state_dim, control_dim, reward_layers)
         activate(self.reward, self.activation)
 
     @classmethod
@@ -107,6 +115,8 @@ class WorldModelAgent(WorldModel, ABC):
 
     def log_probs(self, filtered: Filtered, batch: SequenceBatch) -> dict[str, Tensor]:
         """Return what the model predicts in addition to observations, by name: log p(r_t | f_t) in nats, `(B, T)`."""
+        if isinstance(self.reward, TwoHotHead):
+            return {"reward": -self.reward.error(filtered.features, batch.reward)}
         return {"reward": log_normal(batch.reward, self.reward(filtered.features), self.reward_std)}
 
 

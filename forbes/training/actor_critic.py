@@ -1,5 +1,6 @@
 """FORBES and Dreamer as a LightningModule: a world model, and an actor and a critic that learn in its imagination."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -7,9 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from forbes.control.actor_critic import ImaginedWorld, actor_critic_losses
+from forbes.control.actor_critic import ActorCritic, ImaginedWorld, actor_critic_losses
 from forbes.control.agent import ActionSelector, explore, greedy
 from forbes.control.policy import Actor, ScalarHead
+from forbes.control.return_scale import ReturnScale
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError, require_at_least
 from forbes.models import Filtered
@@ -44,6 +46,8 @@ class ImaginationActorCritic(WorldModelAgent):
     and trajectories that start where an episode has terminated do not count (Dreamer's `pcont`, off in its published
     runs and in the paper).
 
+    `two_hot`, `scale_returns` and `slow_critic` are of DreamerV3 (arXiv 2301.04104), off by default.
+
     Args:
         trajectories: imagined trajectories per belief, N.
         horizon: imagined steps, H, at least 2.
@@ -57,12 +61,15 @@ class ImaginationActorCritic(WorldModelAgent):
         continuation: learn where episodes terminate; needed where they do so other than by a time limit.
         actor_layers: hidden layers of the actor.
         critic_layers: hidden layers of the critic.
+        scale_returns: divide the returns in the actor's loss by their running range, see `ReturnScale`.
+        slow_critic: share of the critic that its moving average takes on in an update, 0.02 in DreamerV3. The critic is
+            held to it: :math:`L_{critic}` also has its error with the average's value as the target. 0 for none.
         actor_rate: learning rate of the actor.
         critic_rate: learning rate of the critic.
         **acting: arguments of `WorldModelAgent` and `WorldModel`, whose learning rate is that of model and reward.
 
     Raises:
-        ForbesError: when N or a size is below 1, H below 2, or the data have no actions.
+        ForbesError: when N or a size is below 1, H below 2, `slow_critic` not in [0, 1], or the data have no actions.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Experience("mountain_hike"), length=30, batch_size=20)
@@ -84,6 +91,8 @@ class ImaginationActorCritic(WorldModelAgent):
         continuation: bool = False,
         actor_layers: int = 2,
         critic_layers: int = 2,
+        scale_returns: bool = False,
+        slow_critic: float = 0.0,
         actor_rate: float = 8e-5,
         critic_rate: float = 8e-5,
         **acting: Any,
@@ -95,12 +104,17 @@ class ImaginationActorCritic(WorldModelAgent):
         require_at_least(0, name, actor_rate=actor_rate, critic_rate=critic_rate, actor_entropy=actor_entropy)
         if not actor_min_std > 0:
             raise ForbesError(f"{name}: actor_min_std is {actor_min_std}, expected a number above 0. 1e-4 is Dreamer's")
+        if not 0 <= slow_critic <= 1:
+            raise ForbesError(f"{name}: slow_critic is {slow_critic}, expected 0 to 1. 0.02 is DreamerV3's")
         features = self.model.hidden_dim + self.model.state_dim
         self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers, self.discrete, actor_min_std)
-        self.critic = ScalarHead(features, control_dim, critic_layers)
+        self.critic = self.scalar_head(features, control_dim, critic_layers)
         self.continues = ScalarHead(features, control_dim, self.reward_layers) if continuation else None
         for network in filter(None, (self.actor, self.critic, self.continues)):
             activate(network, self.activation)
+        self.slow_critic = copy.deepcopy(self.critic).requires_grad_(False) if slow_critic else None
+        self.slow_critic_rate = slow_critic
+        self.return_scale = ReturnScale() if scale_returns else None
         self.trajectories, self.horizon, self.discount, self.lambda_ = trajectories, horizon, discount, lambda_
         self.actor_rate, self.critic_rate, self.actor_entropy = actor_rate, critic_rate, actor_entropy
 
@@ -141,10 +155,11 @@ class ImaginationActorCritic(WorldModelAgent):
             filtered: the beliefs, `(B, T, …)`.
             start_mask: which of them an imagined trajectory starts from, bool `(B, T)`.
         """
+        if self.slow_critic is not None and self.training:
+            self._follow_critic(self.slow_critic)
         return actor_critic_losses(
             ImaginedWorld(self.model, self.reward, self.continues),
-            self.actor,
-            self.critic,
+            ActorCritic(self.actor, self.critic, self.slow_critic, self.return_scale),
             filtered,
             start_mask,
             trajectories=self.trajectories,
@@ -153,6 +168,12 @@ class ImaginationActorCritic(WorldModelAgent):
             lambda_=self.lambda_,
             actor_entropy=self.actor_entropy,
         )
+
+    @torch.no_grad()
+    def _follow_critic(self, slow: ScalarHead) -> None:
+        """Move the moving average towards the critic, before an update of it."""
+        for average, parameter in zip(slow.parameters(), self.critic.parameters(), strict=True):
+            average.lerp_(parameter, self.slow_critic_rate)
 
     def groups(self) -> list[Group]:
         """See `SeededModule.groups`: three, so that clipping one gradient does not shrink the others."""

@@ -1,11 +1,13 @@
 """The actor's distribution against torch.distributions."""
 
+import math
+
 import pytest
 import torch
 from torch.distributions import Independent, Normal, OneHotCategorical, TanhTransform, TransformedDistribution
 
 from forbes.control import policy as policies
-from forbes.control.policy import Actor, ScalarHead, TanhNormal
+from forbes.control.policy import Actor, ScalarHead, TanhNormal, TwoHotHead
 
 
 def policy(*shape, std=1.0):
@@ -120,7 +122,8 @@ def test_shapes(shape, discrete):
     assert [values.shape for values in policy.rsample()] == [(*shape, 2), shape]
     assert policy.mode().shape == (*shape, 2)
     assert TanhNormal(torch.zeros(*shape, 2), torch.ones(*shape, 2)).rsample((5,))[0].shape == (5, *shape, 2)
-    assert ScalarHead(6, 8, 1)(features).shape == shape
+    for head in (ScalarHead(6, 8, 1), TwoHotHead(6, 8, 1)):
+        assert head(features).shape == head.error(features, torch.zeros(shape)).shape == shape
 
 
 @pytest.mark.parametrize("floor", [1e-4, 0.1])
@@ -129,3 +132,35 @@ def test_the_actors_spread_never_falls_below_its_floor(floor):
     torch.nn.init.constant_(actor.head.bias, -1000.0)
 
     torch.testing.assert_close(actor(torch.zeros(5, 6)).std, torch.full((5, 2), floor))
+
+
+def test_an_untrained_two_hot_head_says_exactly_zero():
+    """Bins reach 5e8; in float32 a plain sum of equal shares of them is off by more than a reward."""
+    assert TwoHotHead(6, 8, 1)(torch.randn(100, 6)).abs().max() == 0
+
+
+def test_the_best_two_hot_head_has_the_mean_of_its_targets():
+    """The cross-entropy is least where π is the mean code, whose mean is the mean of the targets."""
+    torch.manual_seed(0)
+    head, target = TwoHotHead(1, 4, 1, bins=21).double(), torch.tensor([-3.0, 0.5, 40.0, 0.0], dtype=torch.float64)
+    same = torch.zeros(4, 1, dtype=torch.float64)
+    optimizer = torch.optim.LBFGS(head.parameters(), max_iter=2000, tolerance_grad=1e-9, tolerance_change=1e-14)
+
+    def closure():
+        optimizer.zero_grad()
+        loss = head.error(same, target).mean()
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+
+    torch.testing.assert_close(head(same), target.mean().expand(4), rtol=1e-3, atol=0)
+
+
+def test_the_error_of_a_scalar_is_a_gaussians_but_for_a_constant():
+    torch.manual_seed(0)
+    head, features, target = ScalarHead(6, 8, 1), torch.randn(5, 6), torch.randn(5)
+
+    nats = -Normal(head(features), 1).log_prob(target)
+
+    torch.testing.assert_close(head.error(features, target), nats - 0.5 * math.log(2 * math.pi))

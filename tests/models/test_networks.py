@@ -127,6 +127,16 @@ def test_perceptron_ends_with_its_activation(activation, lowest):
     assert output.min() == lowest
 
 
+def test_a_normed_layer_does_not_feel_the_scale_of_its_input():
+    """Exact but for epsilon, 1e-3 of the variance: here 1e-3 of at least 1e4."""
+    network = MLP(3, width=50, layers=1)
+    activate(network, "norm_silu")
+    torch.nn.init.zeros_(network[0][0].bias)
+    rows = 1e3 * torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
+
+    torch.testing.assert_close(network(10 * rows), network(rows), rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize(("network", "sizes"), [(ConvEncoder, ()), (ConvDecoder, (10,))])
 @pytest.mark.parametrize("shape", [(5,), (3, 3, 64), (1, 64, 3)])
 def test_convolutions_are_not_for_vectors_or_specks(network, sizes, shape):

@@ -100,10 +100,14 @@ def test_a_step_more_than_was_prepared_is_one_sentence(family):
 
 
 @pytest.mark.usefixtures("same_noise")
-@pytest.mark.parametrize(("activation", "kl"), [("relu", "monte_carlo"), ("elu", "monte_carlo"), ("relu", "path")])
+@pytest.mark.parametrize(
+    ("activation", "kl"),
+    [("relu", "monte_carlo"), ("elu", "monte_carlo"), ("norm_silu", "monte_carlo"), ("relu", "path")],
+)
 def test_the_bound_and_its_gradients_are_those_of_the_plain_loop(family, activation, kl):
     model, (observation, action, mask) = random_model(family), sequences()
     activate(model, activation)
+    model.double()
     if not model.posterior.reparameterised:
         kl = "monte_carlo"
 

@@ -9,6 +9,7 @@ from batches import batch_of
 
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.control.actor_critic import sample_starts
+from forbes.control.policy import TwoHotHead
 from forbes.errors import ForbesError
 from forbes.models import MLPDecoder, MLPEncoder, State, VectorNormal
 from forbes.training import ImaginationActorCritic, WorldModel
@@ -189,6 +190,73 @@ def test_imagined_rewards_and_values_match_their_states(entropy, trajectories):
     torch.testing.assert_close(gradients(actor, [ours.actor]), gradients(-acting.mean() / 3, [ours.actor]))
     errors = [(value - target) ** 2 / 2 for value, target in zip(v, (first, second, third), strict=False)]
     torch.testing.assert_close(critic, (errors[0] + g * errors[1] + g**2 * errors[2]).mean() / 3)
+
+
+def test_the_actors_returns_are_divided_by_their_range():
+    batch, found = make_batch(1, 2), {}
+    for scaled in (False, True):
+        ours = agent(scale_returns=scaled)
+        if scaled:
+            ours.return_scale.percentiles.copy_(torch.tensor([-300.0, 100.0]))
+        ours.eval()
+        filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+        torch.manual_seed(3)
+        found[scaled] = ours.control_losses(filtered, batch.mask)
+
+    (actor, critic), (scaled_actor, same_critic) = found[False], found[True]
+    torch.testing.assert_close(scaled_actor, actor / 400)
+    torch.testing.assert_close(same_critic, critic)
+
+
+def test_the_slow_critic_is_the_critics_moving_average():
+    ours, batch = agent(slow_critic=0.25), make_batch()
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    start = [parameter.clone() for parameter in ours.slow_critic.parameters()]
+    torch.nn.init.ones_(ours.critic.net[1].weight)
+
+    ours.control_losses(filtered, batch.mask)
+
+    for before, fast, slow in zip(start, ours.critic.parameters(), ours.slow_critic.parameters(), strict=True):
+        torch.testing.assert_close(slow.data, 0.75 * before + 0.25 * fast)
+        assert not slow.requires_grad
+    assert not {*ours.slow_critic.parameters()} & {p for group in ours.groups() for p in group.parameters}
+
+
+def test_the_critic_is_held_to_its_slow_average():
+    """Where the average says 7 and the returns are 0, the best value is half way; without it, that of the returns."""
+    best = {}
+    for rate in (0.0, 1e-9):
+        ours, batch = agent(slow_critic=rate), make_batch()
+        filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+        for head, value in ((ours.reward, 0.0), (ours.critic, 0.0), (ours.slow_critic, 7.0)):
+            if head is not None:
+                torch.nn.init.zeros_(head.net[1].weight)
+                torch.nn.init.constant_(head.net[1].bias, value)
+        _, loss = ours.control_losses(filtered, batch.mask)
+        best[rate] = -gradients(loss, [ours.critic.net[1]])[1].item() / sum(0.99**k for k in range(3)) * 3
+
+    assert best[0.0] == pytest.approx(0, abs=1e-6)
+    assert best[1e-9] == pytest.approx(7, rel=1e-5)  # the negative gradient of v²/2 + (v - 7)²/2 at 0
+
+
+def test_two_hot_rewards_and_values_learn_from_the_codes():
+    ours, batch = agent(two_hot=True), make_batch()
+
+    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
+    reward = ours.log_probs(filtered, batch)["reward"]
+
+    torch.testing.assert_close(reward, -ours.reward.error(filtered.features, batch.reward))
+    assert type(ours.critic) is type(ours.reward) is TwoHotHead
+    for part in gradients(loss_of(ours, batch), [ours.reward.net[1], ours.critic.net[1]]):
+        assert part.abs().max() > 0
+    with pytest.raises(ForbesError, match=r"reward_std is 0.1 with two_hot, which has none"):
+        agent(two_hot=True, reward_std=0.1)
+
+
+@pytest.mark.parametrize("rate", [-0.1, 1.1])
+def test_refuses_a_slow_critic_that_is_no_average(rate):
+    with pytest.raises(ForbesError, match=f"slow_critic is {rate}, expected 0 to 1"):
+        agent(slow_critic=rate)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
