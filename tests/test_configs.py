@@ -82,11 +82,17 @@ def test_a_matched_configuration_has_the_parameters_it_claims(config):
     assert abs(own / other - 1) < 0.05
 
 
-def test_the_controlled_comparison_differs_in_the_belief_alone():
-    dreamer, forbes = (
-        yaml.safe_load((CONFIGS / "dmc" / f"{name}.yaml").read_text()) for name in ("dreamer", "forbes_n1")
-    )
+@pytest.mark.parametrize(
+    ("other", "forbes", "belief", "size"),
+    [
+        ("dreamer", "forbes_n1", "GaussianBelief", None),
+        ("dreamerv3", "forbes_v3", "CategoricalBelief", 1024),  # 32 variables of 32 classes; 30 dimensions of a flow
+    ],
+)
+def test_a_controlled_comparison_differs_in_the_belief_alone(other, forbes, belief, size):
+    configs = [yaml.safe_load((CONFIGS / "dmc" / f"{name}.yaml").read_text()) for name in (other, forbes)]
 
-    beliefs = [config["model"]["init_args"].pop("belief")["class_path"] for config in (dreamer, forbes)]
-    assert beliefs == ["GaussianBelief", "FlowBelief"]
-    assert dreamer == forbes
+    beliefs = [config["model"]["init_args"].pop("belief")["class_path"] for config in configs]
+    assert beliefs == [belief, "FlowBelief"]
+    assert [config["model"]["init_args"].pop("state_dim", None) for config in configs] == [size, None]
+    assert configs[0] == configs[1]
