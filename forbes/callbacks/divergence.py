@@ -68,7 +68,8 @@ class StopAtDivergence(Callback):
         if math.isinf(held):
             return
         update = int(held)
-        AtomicCheckpointIO().save_checkpoint(_failure_record(trainer, module, update), self.run.failure)
+        if trainer.is_global_zero:
+            AtomicCheckpointIO().save_checkpoint(_failure_record(trainer, module, update), self.run.failure)
         command = f"forbes fit --resume {self.run}" if self.run.checkpoint.exists() else "the same command"
         raise DivergedError(
             f"{self.run}: diverged, the loss or gradient of update {update + 1} is not finite. See where: "
