@@ -88,6 +88,7 @@ def _failure_record(trainer: Trainer, module: LightningModule, update: int) -> d
     return {
         "update": update,
         "seed": getattr(module, "seed", None),
+        "processes": trainer.world_size,
         "device": module.device.type,
         "precision": trainer.precision,
         "state_dict": module.state_dict(),

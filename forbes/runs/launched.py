@@ -102,11 +102,15 @@ class EndTogether(Callback):
                 thread._child_processes = []  # type: ignore[attr-defined]  # Lightning's has nothing to observe then
         if others:
             threading.Thread(target=self._watch, args=(others,), daemon=True).start()
-        elif _RUN in os.environ and not is_first():
+        elif not is_first() and launched_devices() is None:
             threading.Thread(target=self._follow, args=(os.getppid(),), daemon=True).start()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Stop watching: each process ends by itself now."""
+        self._over.set()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Stop watching: this process ends already."""
         self._over.set()
 
     def sentence(self) -> str:

@@ -53,6 +53,7 @@ def trained(run, tmp_path):
 
 def draw(callback, module, data, run=None):
     torch.manual_seed(0)
+    callback.folder = run
     with torch.no_grad():
         return callback.draw(SimpleNamespace(), module, data)
 

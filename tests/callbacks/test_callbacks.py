@@ -59,6 +59,7 @@ def draw(callback, run):
     """Draw a finished run."""
     module, data = load_run(run)
     torch.manual_seed(0)
+    callback.folder = run
     with torch.no_grad():
         return callback.draw(SimpleNamespace(), module, data)
 

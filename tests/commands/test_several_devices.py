@@ -161,6 +161,15 @@ def test_a_recorded_update_is_that_of_one_process(tiny_run):
         CudaGraph().on_fit_start(SimpleNamespace(world_size=2), load_run(tiny_run)[0])
 
 
+def test_what_is_not_a_training_uses_one_process(monkeypatch, capsys):
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "test")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+
+    assert error_of(capsys, "evaluate", "runs/any").startswith(
+        "forbes evaluate: uses one process, but torchrun started 2"
+    )
+
+
 def test_slurm_says_how_many_processes_there_are(monkeypatch):
     monkeypatch.setenv("SLURM_NTASKS", "8")
     with pytest.raises(ForbesError, match="SLURM: has 8 tasks, expected --ntasks-per-node too"):
