@@ -69,9 +69,8 @@ class StopOnSignal(Callback):
         if self.received is not None:
             raise SystemExit(128 + number)
         self.received = number
-        if (
-            self._whole_epochs and is_first()
-        ):  # may take minutes; os.write, since the signal may have interrupted a print
+        if self._whole_epochs and is_first():  # may take minutes
+            # `os.write`, since the signal may have interrupted a print
             os.write(2, b"\nstopping after this epoch; once more to stop immediately, and lose it\n")
 
     def _end(self, trainer: Trainer) -> None:
