@@ -36,16 +36,19 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _print(runs: Sequence[TrainedRun], found: Sequence[SelfCalibration], samples: int) -> None:
-    table = Table(title=f"{len(found[0].density)} states sampled from the model, ranked among {samples} of the belief")
+    table = Table(title=f"{len(found[0].tarp)} states sampled from the model, ranked among {samples} of the belief")
     for header in ("run", "family"):
         table.add_column(header, overflow="fold")
     for header in ("within 90 %", "p, density", "p, TARP", "p, values (smallest of D, times D)", "p, classifier"):
         table.add_column(header, justify="right")
     for run, one in zip(runs, found, strict=True):
-        within = coverage(one.density, samples, torch.tensor([0.9])).item()
+        within, density = "n/a", "n/a"
+        if one.density is not None:
+            within = f"{coverage(one.density, samples, torch.tensor([0.9])).item():.1%}"
+            density = f"{pearson(one.density, samples).item():.2g}"
         each = pearson(one.value, samples)
         values = min(1.0, each.min().item() * len(each))  # Bonferroni
         tarp = kolmogorov_smirnov(spread(one.tarp, samples, generator(0, "spread", 0))).item()
-        p_values = (pearson(one.density, samples).item(), tarp, values, one.classifier.p_value)
-        table.add_row(escape(run.path), run.family, f"{within:.1%}", *(f"{p:.2g}" for p in p_values))
+        p_values = (tarp, values, one.classifier.p_value)
+        table.add_row(escape(run.path), run.family, within, density, *(f"{p:.2g}" for p in p_values))
     console(160).print(table)
