@@ -6,7 +6,7 @@ from typing import NoReturn
 from forbes.choices import LONGEST
 from forbes.errors import ForbesError
 
-__all__ = ["ArgumentParser", "positive", "seconds"]
+__all__ = ["ArgumentParser", "add_models", "positive", "seconds"]
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -19,6 +19,24 @@ class ArgumentParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise `ForbesError` instead of printing the usage and exiting."""
         raise ForbesError(f"{self.prog}: {message}. See {self.prog} --help")
+
+
+def add_models(parser: argparse._ActionsContainer) -> None:
+    """Add the options for models that were trained elsewhere."""
+    parser.add_argument(
+        "--model",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("MODULE:CLASS", "KEY=VALUE"),
+        help="model trained elsewhere, by a forbes.ModelAdapter of the current folder, with arguments of its "
+        "constructor; may be repeated (docs/score-your-model.md)",
+    )
+    parser.add_argument(
+        "--data",
+        metavar="DATA",
+        help="data of --model: a configuration or a run folder (default: those of the first RUN)",
+    )
 
 
 def positive(text: str) -> int:

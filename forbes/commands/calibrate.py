@@ -8,11 +8,12 @@ from rich.table import Table
 
 from forbes.commands.console import console
 from forbes.commands.parsers.calibrate import parser
+from forbes.evaluation.adapters import load_all
 from forbes.evaluation.calibration.ranks import coverage
 from forbes.evaluation.calibration.runs import calibrate_run
 from forbes.evaluation.calibration.self_calibration import SelfCalibration
 from forbes.evaluation.calibration.uniformity import kolmogorov_smirnov, pearson, spread
-from forbes.evaluation.runs import TrainedRun, load_runs, run_titles
+from forbes.evaluation.runs import TrainedRun, run_titles
 from forbes.figures.calibration import RankedBelief, calibration
 from forbes.figures.style import method_styles, save_png_and_pdf
 from forbes.seeding import generator
@@ -23,7 +24,7 @@ __all__ = ["main"]
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
-    runs = load_runs(args.runs)
+    runs = load_all(args.runs, args.model, args.data)
     found = [calibrate_run(run, args.sequences, args.time, args.samples, args.seed) for run in runs]
     _print(runs, found, args.samples)
     styles = method_styles(run_titles(runs))

@@ -50,8 +50,11 @@ class TrainedRun(NamedTuple):
 
 
 def method_name(kind: type[nn.Module]) -> str:
-    """Return the published name of a belief family or a model, or that of its class: Mixture for a `MixtureBelief`."""
-    return _PUBLISHED.get(kind, kind.__name__.removesuffix("Belief").removesuffix("Model"))
+    """Return the published name of a belief family or a model, or that of its class: Mixture for a `MixtureBelief`.
+
+    An adapter that is only called Model has the name of its module.
+    """
+    return _PUBLISHED.get(kind, kind.__name__.removesuffix("Belief").removesuffix("Model") or kind.__module__)
 
 
 def model_name(model: BeliefModel) -> str:

@@ -157,6 +157,8 @@ def evaluate(
     found: dict[str, Estimate] = {}
     for name in scores:
         score = make_scorer(name, numbers[PASSES[name]], batch_size, context).of(model)
+        if not score.metrics:  # the model has none of them
+            continue
         scored = score_split(model, split_batches(data, split, count, score.batch_size), score, seed)
         found |= {metric: Estimate.of(scored.total(metric)) for metric in score.metrics}
     return found

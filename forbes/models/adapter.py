@@ -31,14 +31,14 @@ class ModelAdapter(PosteriorModel):
     r"""Any torch world model, to be scored by `forbes evaluate --model my_adapter:Model`.
 
     Load the network in `__init__` and assign it to an attribute. Set `likelihood` to what the decoder's output means,
-    e.g. `forbes.Bernoulli()`; it makes the density normalised, and in the units of the data. A state is a pair of tensors
-    `(hidden, state)`, `(N, H)` and `(N, D)`, with all that the next step and the decoder need; H or D may be 0. The
-    action of a step is the one that led to it, 0 at the first. Implement `initial`, `decode_state`, and
+    e.g. `forbes.Bernoulli()`; it makes the density normalised, and in the units of the data. A state is a pair of
+    tensors `(hidden, state)`, `(N, H)` and `(N, D)`, with all that the next step and the decoder need; H or D may be 0.
+    The action of a step is the one that led to it, 0 at the first. Implement `initial`, `decode_state`, and
 
     - `observe` and `predict`: one draw of the state after one more step, with and without its observation. This gives
       the PLL and the open-loop score; or
-    - `advance`, `prior` and `posterior`: h and the two distributions of s. `observe` and `predict` follow from them, and
-      there are ELBO, IWAE and FIVO too, and a PLL that needs fewer particles.
+    - `advance`, `prior` and `posterior`: h and the two distributions of s. `observe` and `predict` follow from them.
+      There are ELBO, IWAE and FIVO too, and a PLL that needs fewer particles.
 
     Scores that a model lacks are n/a. `embed_target` may be overridden with the encoder, which then runs once for a
     sequence, not in each step of each sample. Of a model without steps, e.g. a transformer, override `beliefs`. An own
@@ -71,8 +71,6 @@ class ModelAdapter(PosteriorModel):
     def __init__(self) -> None:
         super().__init__()
         kind, base = type(self), ModelAdapter
-        if not hasattr(kind, "likelihood"):
-            raise ForbesError(f"{kind.__name__}: has no likelihood. Set it, e.g. likelihood = forbes.Bernoulli()")
         densities = kind.advance is not base.advance and kind.prior is not base.prior
         self.has_densities = densities and kind.posterior is not base.posterior
         self.has_steps = kind.beliefs is base.beliefs
@@ -128,7 +126,7 @@ class ModelAdapter(PosteriorModel):
         return _stacked(states)
 
     def embed_target(self, target: Tensor) -> Tensor:
-        """Encode every frame, as `Likelihood.target` gives it: `(B, T, *O)` to `(B, T, E)`. By default flat as it is."""
+        """Encode every frame, as `Likelihood.target` gives it: `(B, T, *O)` to `(B, T, E)`. Default: flat."""
         return target.flatten(2)
 
     @property
@@ -145,7 +143,9 @@ class ModelAdapter(PosteriorModel):
 
     def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Refuse: an adapter is only scored."""
-        raise ForbesError(f"{type(self).__name__}: an adapter is scored, not trained. Train the model with its own code")
+        raise ForbesError(
+            f"{type(self).__name__}: an adapter is scored, not trained. Train the model with its own code"
+        )
 
     def filter(self, embedding: Tensor, action: Tensor, start: State | None = None) -> Filtered:
         """See `PosteriorModel.filter`, from `initial`. The context of a step is e_t."""

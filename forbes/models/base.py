@@ -123,8 +123,8 @@ class BeliefModel(Configurable, nn.Module, ABC):
     - `imagine`: a trajectory from such a sample, given actions and no observations.
     - `predictive_log_prob`: an estimate of log p(o_t | o_1:t-1) of every step; scores.
 
-    It may override `num_belief_samples`, `lacks` and `logged_terms`. Everything else is shared: `RecurrentModel` has the
-    networks of the models that are trained here. `ModelAdapter` is for a model that was trained elsewhere.
+    It may override `num_belief_samples`, `lacks` and `logged_terms`. Everything else is shared. `RecurrentModel` has
+    the networks of the models that are trained here; `ModelAdapter` is for a model that was trained elsewhere.
     """
 
     logged_terms: ClassVar[tuple[str, ...]] = ("reconstruction", "kl")

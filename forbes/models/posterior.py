@@ -41,7 +41,7 @@ class Filtered(NamedTuple):
 
 
 class PosteriorModel(BeliefModel):
-    """A model that filters by a posterior with a density: an RSSM of any kind, or a `ModelAdapter` that has densities."""
+    """A model that filters by a posterior with a density: an RSSM of any kind, or a `ModelAdapter` with densities."""
 
     @property
     def lacks(self) -> tuple[str, ...]:

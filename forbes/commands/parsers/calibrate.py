@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import ArgumentParser, add_models, positive
 
 __all__ = ["parser"]
 
@@ -22,7 +22,8 @@ calibration.pdf."""
 def parser() -> ArgumentParser:
     """Return the parser of `forbes calibrate`."""
     command = ArgumentParser("forbes calibrate", _DESCRIPTION)
-    command.add_argument("runs", nargs="+", metavar="RUN", help="run folder written by `forbes fit`")
+    command.add_argument("runs", nargs="*", metavar="RUN", help="run folder written by `forbes fit`")
+    add_models(command)
     command.add_argument(
         "--sequences", type=positive, default=1000, help="sequences sampled from the model, N (default: 1000)"
     )

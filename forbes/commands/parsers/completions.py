@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import get_args
 
 from forbes.choices import Split
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import ArgumentParser, add_models, positive
 
 __all__ = ["parser"]
 
@@ -34,7 +34,8 @@ hundred digits on one core."""
 def parser() -> ArgumentParser:
     """Return the parser of `forbes completions`."""
     command = ArgumentParser("forbes completions", _DESCRIPTION)
-    command.add_argument("runs", nargs="+", metavar="RUN", help="run folder of strokes, written by `forbes fit`")
+    command.add_argument("runs", nargs="*", metavar="RUN", help="run folder of strokes, written by `forbes fit`")
+    add_models(command)
     command.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
     command.add_argument("--sequences", "--digits", type=positive, default=300, help="number of digits (default: 300)")
     command.add_argument("--samples", type=positive, default=100, help="completions per digit, N (default: 100)")

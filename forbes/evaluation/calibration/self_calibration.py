@@ -29,7 +29,7 @@ class SelfCalibration(NamedTuple):
     value: Tensor
     """Rank of each dimension of s_t, `(N, D)`."""
     density: Tensor | None
-    """Rank of the belief's log-density, estimated as a mixture over posterior trajectories, `(N,)`; None without one."""
+    """Rank of the belief's log-density, a mixture over posterior trajectories, `(N,)`; None if it has none."""
     tarp: Tensor
     """Rank of the distance from a random point, `(N,)`."""
     classifier: TwoSampleTest
@@ -64,7 +64,7 @@ def self_calibration(model: BeliefModel, action: Tensor, samples: int, seed: int
 
 
 def _log_belief(model: PosteriorModel, encoded: EncodedSequence, state: Tensor) -> Tensor:
-    """Estimate the log-density of the last belief of each sequence at states `(L, N, D)`, in nats, `(L, N)`, on the CPU."""
+    """Estimate the log-density of the last belief of each sequence at `(L, N, D)`: nats, `(L, N)`, on the CPU."""
     density = LogMeanExp()
     for _ in range(_COMPONENTS):
         filtered = model.filter(encoded.embedding, encoded.action)
