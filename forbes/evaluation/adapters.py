@@ -41,8 +41,6 @@ def load_all(
     if not models:
         if data is not None:
             raise ForbesError(f"--data {data}: is for --model; a run has data of its own. Leave it out")
-        if not paths:
-            raise ForbesError("no model to evaluate. Name run folders, or a model of your own: --model MODULE:CLASS")
     elif data is None and not paths:
         raise ForbesError("--model: on which data? Name a run first, or a configuration: --data strokes/forbes")
     runs = load_runs(paths, device)

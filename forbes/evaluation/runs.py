@@ -12,8 +12,8 @@ from torch import nn
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
-from forbes.evaluation.methods import with_suffix, without_seed
 from forbes.models import BeliefModel, StateSpaceModel
+from forbes.runs.naming import with_suffix, without_seed
 from forbes.training.loading import open_run
 
 __all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "method_name", "model_name"]

@@ -127,9 +127,10 @@ def build_data(where: str) -> SequenceDataModule:
         ForbesError: if there is no such thing, or its data do not exist.
     """
     folder = RunFolder(where)
-    file = folder.config if folder.config.is_file() else find_config(where)
+    is_run = folder.config.is_file()
+    file = folder.config if is_run else find_config(where)
     config = read_config(file, ("data",))
-    for key, value in changed_defaults(config).items():
+    for key, value in changed_defaults(config).items() if is_run else ():
         _put(config, key, value)
     parser = data_parser()
     parsed = _parse(parser, {"data": config["data"]}, file)

@@ -5,7 +5,7 @@ import sys
 from typing import get_args
 
 from forbes.choices import PASSES, SUBSET, Split
-from forbes.commands.arguments import ArgumentParser, add_models, positive
+from forbes.commands.arguments import ArgumentParser, RunsParser, positive
 
 __all__ = ["add_acting_samples", "add_output", "add_score_options", "parser"]
 
@@ -58,17 +58,11 @@ pen moves for strokes, the last frame and the mean frame for images. Runs below 
 
 def parser() -> ArgumentParser:
     """Return the parser of `forbes evaluate`."""
-    command = ArgumentParser("forbes evaluate", _DESCRIPTION)
-    command.add_argument(
-        "runs",
-        nargs="*",
-        metavar="RUN",
-        help="run folder written by `forbes fit`, or a checkpoint in it; or pretrained:NAME (`forbes export --help`)",
-    )
+    runs = "run folder written by `forbes fit`, or a checkpoint in it; or pretrained:NAME (`forbes export --help`)"
+    command = RunsParser("forbes evaluate", _DESCRIPTION, runs)
     command.add_argument(
         "--checkpoint", metavar="NAME", help="checkpoint in checkpoints/ of every RUN (default: last.ckpt)"
     )
-    add_models(command)
     add_output(command)
     command.add_argument("--episodes", type=positive, default=10, help="number of episodes per agent (default: 10)")
     add_acting_samples(command)
