@@ -85,8 +85,8 @@ def _show(path: str) -> None:
     facts: dict[str, Any] = {
         "run": run.path,
         "method": f"{run.method} on {run.data}, seed {_count(run.seed)}",
-        "state": f"{run.state}, {_count(run.update)} updates in {run.hours:.2f} hours, started {_times(len(run.starts))}",
-        "started": f"{last.get('started', 'unknown')} ({_age(run.started)} ago)" if run.started else "unknown",
+        "state": f"{run.state}, {_count(run.update)} updates in {run.hours:.2f} hours",
+        "started": f"{len(run.starts)} times, last {_age(run.started)} ago" if run.started else "unknown",
         "commit": last.get("commit", "unknown"),
         "command": last.get("command", "unknown"),
     }
@@ -127,10 +127,6 @@ def _recorded(path: Path) -> dict[str, str]:
             error = entry.get("standard_error")
             found[name] = _value(entry["mean"]) + (f" ± {error:.2f}" if is_number(error) else "")
     return found
-
-
-def _times(number: int) -> str:
-    return "once" if number == 1 else f"{number} times"
 
 
 def _count(value: int | None) -> str:

@@ -28,7 +28,12 @@ BOUNDS = ("elbo", "reconstruction", "kl", "iwae", "fivo", "ess")
 
 @printed_by_shape
 class State(NamedTuple):
-    """The state of the recurrence."""
+    """The state of the recurrence.
+
+    Example:
+        >>> forbes.State(hidden=torch.zeros(5, 200), state=torch.zeros(5, 8))
+        State(hidden=float32 (5, 200), state=float32 (5, 8))
+    """
 
     hidden: Tensor
     """h, `(*, H)`."""
