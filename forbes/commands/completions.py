@@ -32,7 +32,7 @@ _DRAWN = 10  # digits per figure
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
-    runs = load_all(args.runs, args.model, args.data)
+    runs = load_all(args.runs, args.model, args.data, needs=("sample", "mean"))
     _check(args, runs)
     data = runs[0].data
     hashes = [data_sha256(run.data, args.split, args.sequences) for run in runs]

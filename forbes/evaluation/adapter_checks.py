@@ -10,7 +10,7 @@ An own likelihood is summed over all symbols, or compared with a normalised g th
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -50,13 +50,14 @@ _UNITS: dict[int, dict[str, Likelihood]] = {
 
 
 @torch.no_grad()
-def check_model(model: BeliefModel, data: SequenceDataModule, where: str) -> None:
+def check_model(model: BeliefModel, data: SequenceDataModule, where: str, needs: Sequence[str] = ()) -> None:
     """Check a model in eval mode on the first sequences of its data.
 
     Args:
         model: the model, on any device.
         data: data that it is evaluated on.
         where: name of the model, for error messages.
+        needs: methods that the likelihood must have, of `sample` and `mean`.
 
     Raises:
         ForbesError: if the model does not do what `ModelAdapter` asks for; says which method, and what it returns.
@@ -85,6 +86,12 @@ def check_model(model: BeliefModel, data: SequenceDataModule, where: str) -> Non
     if has_posterior(model):
         _check_weights(model, encoded, where)
     _check_normalised(model, encoded, where)
+    output = model.decode(torch.cat(model.sample_beliefs(encoded, 1), -1))  # (B, *P)
+    for name in needs:
+        try:
+            getattr(model.likelihood, name)(output)
+        except NotImplementedError as error:
+            raise ForbesError(f"{where}: its likelihood has no {name}, which is needed here. Implement it") from error
 
 
 def _check_methods(model: ModelAdapter, observation: Tensor, action: Tensor, where: str) -> None:

@@ -25,7 +25,11 @@ __all__ = ["adapter_folder", "load_adapter", "load_all"]
 
 
 def load_all(
-    paths: Sequence[str], models: Sequence[Sequence[str]], data: str | None, device: str = "cpu"
+    paths: Sequence[str],
+    models: Sequence[Sequence[str]],
+    data: str | None,
+    device: str = "cpu",
+    needs: Sequence[str] = (),
 ) -> list[TrainedRun]:
     """Load runs, and models that were trained elsewhere.
 
@@ -34,6 +38,7 @@ def load_all(
         models: for each model the words of `--model`: MODULE:CLASS and arguments of its constructor, KEY=VALUE.
         data: configuration or run folder with the data of the models; None for those of the first run.
         device: device of all models.
+        needs: methods of the likelihood that the command needs, of `sample` and `mean`; an adapter may have none.
 
     Raises:
         ForbesError: if there is nothing to load, a model cannot be loaded, or it fails a check.
@@ -46,11 +51,13 @@ def load_all(
     runs = load_runs(paths, device)
     if models:
         source = runs[0].data if data is None else build_data(data)
-        runs += [load_adapter(words, source, device) for words in models]
+        runs += [load_adapter(words, source, device, needs) for words in models]
     return runs
 
 
-def load_adapter(words: Sequence[str], data: SequenceDataModule, device: str = "cpu") -> TrainedRun:
+def load_adapter(
+    words: Sequence[str], data: SequenceDataModule, device: str = "cpu", needs: Sequence[str] = ()
+) -> TrainedRun:
     """Load and check one model: its module, from the current folder or as installed, its class and its arguments."""
     name = shortened(" ".join(words), 120)
     where = f"--model {name}"
@@ -61,7 +68,7 @@ def load_adapter(words: Sequence[str], data: SequenceDataModule, device: str = "
         raise ForbesError(f"{where}: has no parameters. Assign the network to an attribute of the adapter in __init__")
     model = model.eval().to(device)
     model.requires_grad_(False)
-    _run(f"{where}", lambda: check_model(model, data, where))
+    _run(f"{where}", lambda: check_model(model, data, where, needs))
     section = {"class_path": words[0], "init_args": arguments}
     return TrainedRun(
         " ".join(words), model, data, _sha256(model), {"model": section, "data": {"source": str(data.source)}}

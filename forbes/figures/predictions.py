@@ -46,7 +46,7 @@ def draw_predictions(
         ForbesError: if the observations are no images, the runs are of different data, or an argument does not fit
             the data.
     """
-    trained = load_all(runs, model, data)
+    trained = load_all(runs, model, data, needs=("sample", "mean"))
     for run in trained:
         require_images(run.path, run.data.observation_shape, "Name runs of images, e.g. of strokes")
         if not run.data.source.size("test"):

@@ -215,6 +215,20 @@ def test_an_own_likelihood_is_normalised_and_in_units_of_the_data(likelihood, se
             check_model(model, DATA, "mine")
 
 
+class NoSampler(forbes.VectorNormal):
+    def sample(self, output):
+        raise NotImplementedError
+
+
+def test_a_likelihood_without_a_sampler_is_refused_only_where_it_is_needed():
+    model = Right().eval()
+    model.likelihood = NoSampler()
+
+    check_model(model, DATA, "mine")
+    with pytest.raises(ForbesError, match="its likelihood has no sample, which is needed here"):
+        check_model(model, DATA, "mine", needs=("sample", "mean"))
+
+
 class Symbols(forbes.OneHot):
     """A softmax over all symbols, times a factor."""
 
