@@ -59,7 +59,7 @@ def train(data, updates, path):
     """Train on the batches of a data module, and save sizes and weights."""
     torch.manual_seed(0)
     model = Dreamer(pixels=torch.Size(data.observation_shape).numel(), actions=data.action_dim)
-    optimizer = torch.optim.Adam(model.parameters(), 1e-3)
+    optimizer = torch.optim.Adam(model.parameters(), 6e-3)
     for update in range(updates):
         batch = data.sequences("train", data.train_index(update))
         optimizer.zero_grad()

@@ -32,6 +32,7 @@ class RunsParser(ArgumentParser):
     def parse_args(self, *arguments: Any) -> argparse.Namespace:  # type: ignore[override]  # of its overloads, ours
         """Parse, and require a run or a model."""
         found: argparse.Namespace = super().parse_args(*arguments)
+        found.model = found.model or []
         if not found.runs and not found.model:
             self.error("the following arguments are required: RUN, or --model MODULE:CLASS")
         return found
@@ -43,7 +44,6 @@ def add_models(parser: argparse._ActionsContainer) -> None:
         "--model",
         nargs="+",
         action="append",
-        default=[],
         metavar=("MODULE:CLASS", "KEY=VALUE"),
         help="model trained elsewhere, by a forbes.ModelAdapter of the current folder, with arguments of its "
         "constructor; may be repeated (docs/score-your-model.md)",

@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> None:
 
 def _given(args: argparse.Namespace) -> dict[str, object]:
     """Return the options of single figures that were given."""
-    return {name: value for name in OPTIONS if (value := getattr(args, name)) not in (None, [])}
+    return {name: value for name in OPTIONS if (value := getattr(args, name)) is not None}
 
 
 def _table() -> Table:

@@ -82,11 +82,12 @@ def _show(path: str) -> None:
     run = summarise(path)
     screen = console(_WIDTH)
     last = run.starts[-1] if run.starts else {}
+    more = len(run.starts) > 1
     facts: dict[str, Any] = {
         "run": run.path,
         "method": f"{run.method} on {run.data}, seed {_count(run.seed)}",
         "state": f"{run.state}, {_count(run.update)} updates in {run.hours:.2f} hours",
-        "started": f"{len(run.starts)} times, last {_age(run.started)} ago" if run.started else "unknown",
+        "started": (f"{_age(run.started)} ago" if run.started else "unknown") + f", {len(run.starts)} starts" * more,
         "commit": last.get("commit", "unknown"),
         "command": last.get("command", "unknown"),
     }
