@@ -15,8 +15,8 @@ _PUBLIC = {
     "envs": "DeepMindControl Gymnasium find_environment",
     "errors": "ForbesError",
     "evaluation": "CalibrationError ELBO PLL complete evaluate filter imagine",
-    "models": "Bernoulli ConvDecoder ConvEncoder MLPDecoder MLPEncoder ModelParts Normal OneHot OnePixel "
-    "ParticleModel PixelDecoder PixelEncoder StateSpaceModel VectorModel VectorNormal",
+    "models": "Bernoulli ConvDecoder ConvEncoder MLPDecoder MLPEncoder ModelAdapter ModelParts Normal OneHot "
+    "OnePixel ParticleModel PixelDecoder PixelEncoder State StateSpaceModel VectorModel VectorNormal",
     "pomdps": "LightDark LinearGaussian MirrorSensor MountainHike TMaze Tiger Ungm",
     "training": "ImaginationActorCritic KnownBelief PlanningAgent WorldModel",
     "training.loading": "load_run",

@@ -1,12 +1,12 @@
 """Argument parsing for the commands that Lightning does not parse. Errors are one sentence."""
 
 import argparse
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from forbes.choices import LONGEST
 from forbes.errors import ForbesError
 
-__all__ = ["ArgumentParser", "positive", "seconds"]
+__all__ = ["ArgumentParser", "RunsParser", "add_models", "positive", "seconds"]
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -19,6 +19,40 @@ class ArgumentParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise `ForbesError` instead of printing the usage and exiting."""
         raise ForbesError(f"{self.prog}: {message}. See {self.prog} --help")
+
+
+class RunsParser(ArgumentParser):
+    """The parser of a command on runs, and on models that were trained elsewhere."""
+
+    def __init__(self, prog: str, description: str, runs: str) -> None:
+        super().__init__(prog, description)
+        self.add_argument("runs", nargs="*", metavar="RUN", help=runs)
+        add_models(self)
+
+    def parse_args(self, *arguments: Any) -> argparse.Namespace:  # type: ignore[override]  # of its overloads, ours
+        """Parse, and require a run or a model."""
+        found: argparse.Namespace = super().parse_args(*arguments)
+        found.model = found.model or []
+        if not found.runs and not found.model:
+            self.error("the following arguments are required: RUN, or --model MODULE:CLASS")
+        return found
+
+
+def add_models(parser: argparse._ActionsContainer) -> None:
+    """Add the options for models that were trained elsewhere."""
+    parser.add_argument(
+        "--model",
+        nargs="+",
+        action="append",
+        metavar=("MODULE:CLASS", "KEY=VALUE"),
+        help="model trained elsewhere, by a forbes.ModelAdapter of the current folder, with arguments of its "
+        "constructor; may be repeated (docs/score-your-model.md)",
+    )
+    parser.add_argument(
+        "--data",
+        metavar="DATA",
+        help="data of --model: a configuration or a run folder (default: those of the first RUN)",
+    )
 
 
 def positive(text: str) -> int:

@@ -33,6 +33,7 @@ COMMANDS = {
     "configs": Command(
         "list, show and copy configurations", "copy strokes/forbes mine.yaml", "forbes.commands.configs:main"
     ),
+    "runs": Command("list runs and show their curves", "show RUN", "forbes.commands.runs:main"),
     "replay": Command("show where a training diverged", "RUN/failure.pt", "forbes.commands.replay:main"),
     "evaluate": Command("evaluate trained models and compare them", "RUN RUN", "forbes.commands.evaluate:main"),
     "rollout": Command("record an agent as a GIF", "RUN --video agent.gif", "forbes.commands.rollout:main"),
