@@ -393,7 +393,7 @@ WRONG = {
     "its observation is not finite at step 1": {"observation": broken(WHOLE.observation, 1, 1)},
     r"its reward is float32 \(5,\)": {"reward": WHOLE.reward[:-1]},
     r"its action is float64 \(6, 1\), expected float32": {"action": WHOLE.action.astype(float)},
-    r"its observation is int64 \(6, 2\), expected uint8 of rank 4 or float32 of rank 2": {"observation": WHOLE.observation.astype(int)},
+    r"its observation is int64 \(6, 2\), expected uint8 of rank 4": {"observation": WHOLE.observation.astype(int)},
     r"its observation is float32 \(1, 2\), .* at least 2 steps": {
         "observation": WHOLE.observation[:1], "action": WHOLE.action[:1], "reward": WHOLE.reward[:1]
     },
