@@ -14,6 +14,9 @@ Origin: TypeAlias = Literal["bundled", "dejong"]
 
 FORMATS = {
     "dreamer": "dreamer:Dreamer",
+    "robomimic": "robomimic:Robomimic",
+    "stable-worldmodel": "stable_worldmodel:StableWorldModel",
+    "arrays": "arrays:Arrays",
 }
 """Formats of recorded episodes in the order of recognition: module in `forbes.data.imports`, class of its reader."""
 EXPORTS = ("hdf5", "minari", "npz")
