@@ -17,6 +17,7 @@ FORMATS = {
     "robomimic": "robomimic:Robomimic",
     "stable-worldmodel": "stable_worldmodel:StableWorldModel",
     "arrays": "arrays:Arrays",
+    "minari": "minari:Minari",
 }
 """Formats of recorded episodes in the order of recognition: module in `forbes.data.imports`, class of its reader."""
 EXPORTS = ("hdf5", "minari", "npz")
