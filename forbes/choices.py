@@ -18,6 +18,7 @@ FORMATS = {
     "stable-worldmodel": "stable_worldmodel:StableWorldModel",
     "arrays": "arrays:Arrays",
     "minari": "minari:Minari",
+    "frames": "frames:Frames",
 }
 """Formats of recorded episodes in the order of recognition: module in `forbes.data.imports`, class of its reader."""
 EXPORTS = ("hdf5", "minari", "npz")
