@@ -18,6 +18,7 @@ FORMATS = {
     "stable-worldmodel": "stable_worldmodel:StableWorldModel",
     "arrays": "arrays:Arrays",
     "minari": "minari:Minari",
+    "lerobot": "lerobot:LeRobot",
     "frames": "frames:Frames",
 }
 """Formats of recorded episodes in the order of recognition: module in `forbes.data.imports`, class of its reader."""
