@@ -19,6 +19,7 @@ FORMATS = {
     "arrays": "arrays:Arrays",
     "minari": "minari:Minari",
     "lerobot": "lerobot:LeRobot",
+    "lance": "lance:Lance",
     "frames": "frames:Frames",
 }
 """Formats of recorded episodes in the order of recognition: module in `forbes.data.imports`, class of its reader."""
