@@ -1,4 +1,4 @@
-"""`forbes data import`: episodes from other formats."""
+"""`forbes data import` and `export`: episodes from and to other formats."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,13 +12,14 @@ from forbes.commands.console import console
 from forbes.commands.episodes import count_steps
 from forbes.data.episodes.episode import EpisodeRecord
 from forbes.data.episodes.store import EpisodeStore
+from forbes.data.exports import export_store
 from forbes.data.imports.formats import open_reader
 from forbes.data.imports.importing import import_episodes, is_imported, partial_path
 from forbes.data.imports.source import SAMPLE, Source
 from forbes.data.imports.survey import survey
 from forbes.files import require_room
 
-__all__ = ["import_"]
+__all__ = ["export", "import_"]
 
 
 def import_(
@@ -66,6 +67,24 @@ def import_(
             require_room(partial_path(output), "the remaining episodes", (len(source) - begun - 1) * record.size)
         records.append(record)
     print(f"{output}: {len(records)} episodes imported, {count_steps(records)}")
+
+
+def export(path: Path, output: Path, format: str) -> None:
+    """Export the episodes of a store to another format, without loss.
+
+    Args:
+        path: folder of the store.
+        output: file or folder to write, which must not exist.
+        format: name of the format.
+
+    Raises:
+        ForbesError: if the store has no episodes, an episode is damaged, or the output exists.
+    """
+    store = EpisodeStore(path)
+    store.require_episodes()
+    exported = export_store(store, output, format)
+    count = sum(1 for _ in track(exported, f"Exporting {path}", len(store.records), console=Console(stderr=True)))
+    print(f"{output}: {count} episodes exported, {count_steps(list(store.records.values()))}")
 
 
 def _print(source: Source) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import get_args
 
-from forbes.choices import FORMATS, Dataset, Fetched, Origin, Split
+from forbes.choices import EXPORTS, FORMATS, Dataset, Fetched, Origin, Split
 from forbes.commands.arguments import ArgumentParser, positive, rate, seconds
 from forbes.envs.tasks import TASKS
 
@@ -171,3 +171,11 @@ def _add_imports(of_data: _Parser) -> None:
     take.add_argument("--resize", type=positive, metavar="PIXELS", help="side of the images (default: as they are)")
     take.add_argument("--fps", type=rate, help="steps per second to keep, a fraction of the data's (default: all)")
     take.add_argument("--dry-run", action="store_true", help="print the table of what there is, and import nothing")
+
+    summary = "Export the episodes of a store to another format, without loss."
+    give = of_data.add(
+        "export", "forbes.commands.imports:export", summary, "export episodes/mine --format hdf5 -o mine.hdf5"
+    )
+    give.add_argument("path", type=Path, metavar="STORE", help=_STORED)
+    give.add_argument("--format", choices=EXPORTS, required=True, help="format to write")
+    give.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write, which must not exist")
