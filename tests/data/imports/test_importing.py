@@ -1,0 +1,200 @@
+"""An import ends with a whole store or with none, after a kill too, and needs the memory of one episode."""
+
+import multiprocessing
+import os
+import signal
+import tracemalloc
+
+import numpy as np
+import pytest
+import recordings
+
+from forbes.choices import EXPORTS
+from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
+from forbes.data.exports import export_store
+from forbes.data.imports.formats import open_reader
+from forbes.data.imports.importing import import_episodes, is_imported, partial_path
+from forbes.data.imports.source import Source
+from forbes.data.imports.survey import survey
+from forbes.errors import ForbesError
+
+
+def source(path, **options):
+    return Source(open_reader(path), path, **options)
+
+
+def imported(path, output, **options):
+    return list(import_episodes(source(path, **options), output))
+
+
+def content(store):
+    """The files of a store, but for the process in its lock."""
+    return {path.name: path.read_bytes() for path in store.rglob("*") if path.is_file() and path.name != ".lock"}
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """A folder of six episodes."""
+    return recordings.write("dreamer", tmp_path / "recorded", recordings.episodes(6))
+
+
+def test_an_imported_episode_says_where_it_is_from(recorded, tmp_path):
+    records = imported(recorded, tmp_path / "store")
+
+    assert [record.steps for record in records] == [4, 5, 6, 7, 8, 9]
+    assert records[0].environment == {
+        "task": "recorded",
+        "observation_shape": [2],
+        "action_dim": 1,
+        "discrete": False,
+        "action_repeat": 1,
+        "imported": {"format": "dreamer", "resize": None, "keys": ["state", "action", "reward"]},
+    }
+    assert list(EpisodeStore(tmp_path / "store").records) == [0, 1, 2, 3, 4, 5]
+    assert not partial_path(tmp_path / "store").exists()
+    assert is_imported(source(recorded), tmp_path / "store")
+
+
+def import_and_die(recorded, output, when):
+    """Import, and be killed at the n-th time that something is synced to the disk."""
+    calls, sync = [], os.fsync
+
+    def fsync(descriptor):
+        calls.append(1)
+        if len(calls) == when:
+            os.kill(os.getpid(), signal.SIGKILL)
+        sync(descriptor)
+
+    os.fsync = fsync
+    imported(recorded, output)
+
+
+@pytest.mark.parametrize("when", [1, 2, 3, 4, 7, 9, 10, 19, 20, 21, 22])  # files, folders, index; at last the new name
+def test_a_killed_import_continues_to_the_same_bytes(when, recorded, tmp_path):
+    imported(recorded, tmp_path / "whole")
+    store = tmp_path / "store"
+    process = multiprocessing.get_context("fork").Process(target=import_and_die, args=(recorded, store, when))
+    process.start()
+    process.join()
+
+    assert process.exitcode == -signal.SIGKILL
+    assert store.exists() == (when == 22)
+    if not store.exists():
+        imported(recorded, store)
+    assert is_imported(source(recorded), store)
+    assert content(store) == content(tmp_path / "whole")
+
+
+def test_an_import_does_not_continue_another_one(recorded, tmp_path):
+    (tmp_path / "others").mkdir()
+    other = recordings.write("dreamer", tmp_path / "others" / "recorded", recordings.episodes(6, seed=1))
+    begun = import_episodes(source(recorded), tmp_path / "store")
+    next(begun)
+    begun.close()
+
+    with pytest.raises(ForbesError, match=r"store\.partial: has episodes that are not those of .*others"):
+        imported(other, tmp_path / "store")
+    with pytest.raises(ForbesError, match=r"store\.partial: has episodes that are not those"):
+        imported(recorded, tmp_path / "store", reward="action")
+
+
+def test_a_folder_with_anything_else_is_left_alone(recorded, tmp_path):
+    (tmp_path / "notes").mkdir()
+    imported(recorded, tmp_path / "store")
+
+    with pytest.raises(ForbesError, match=r"notes: exists and is not a store of"):
+        is_imported(source(recorded), tmp_path / "notes")
+    with pytest.raises(ForbesError, match=r"store: exists and is not a store of"):
+        is_imported(source(recorded, reward="action"), tmp_path / "store")
+    assert not is_imported(source(recorded), tmp_path / "new")
+
+
+def test_memory_is_that_of_an_episode(tmp_path):
+    recorded, size = tmp_path / "recorded", 0
+    recorded.mkdir()
+    for number in range(40):
+        image = np.random.default_rng(number).integers(0, 256, (30, 64, 64, 3), np.uint8)
+        np.savez(recorded / f"{number:02d}.npz", image=image, action=np.zeros((30, 1), np.float32))
+        size = image.nbytes
+    tracemalloc.start()
+    imported(recorded, tmp_path / "store")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert peak < 8 * size < 40 * size  # the array, its images, their copy, and the file of it
+
+
+@pytest.mark.parametrize("images", [False, True], ids=["vectors", "images"])
+@pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
+@pytest.mark.parametrize("name", EXPORTS)
+def test_an_exported_store_is_imported_bit_for_bit(name, discrete, images, tmp_path):
+    pytest.importorskip({"hdf5": "h5py", "minari": "minari"}.get(name, "numpy"))
+    random = np.random.default_rng(0)
+    about = {"task": "toy", "action_dim": 3, "discrete": discrete}
+    with EpisodeWriter(tmp_path / "store") as writer:
+        for episode in recordings.episodes(4, images=images):
+            steps = len(episode.reward) - 1
+            action = np.eye(3)[random.integers(3, size=steps)] if discrete else random.uniform(-1, 1, (steps, 3))
+            action = np.concatenate([np.zeros((1, 3)), action]).astype(np.float32)
+            observation = episode.observation
+            if images:
+                observation = random.integers(0, 256, observation.shape, np.uint8)
+            about["observation_shape"] = list(observation.shape[1:])
+            writer.append(episode._replace(observation=observation, action=action), 0, "test", about)
+        writer.quarantine(1)
+    store = EpisodeStore(tmp_path / "store")
+
+    assert list(export_store(store, tmp_path / "exported", name)) == [0, 1, 2]
+    found = source(tmp_path / "exported")
+
+    assert (found.discrete, len(found)) == (discrete, 3)
+    for number, ours in zip(store.records, map(found.episode, range(3)), strict=True):
+        theirs = store.episode(number)
+        for one, other in zip(ours[:3], theirs[:3], strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+        assert ours.terminated == theirs.terminated
+    with pytest.raises(ForbesError, match="exported: exists"):
+        next(export_store(store, tmp_path / "exported", name))
+
+
+def test_integers_become_one_hot_actions(tmp_path):
+    (tmp_path / "recorded").mkdir()
+    for number in range(3):
+        arrays = {"state": np.ones((4, 2)), "action": np.array([0, number, 1, 0])}
+        np.savez(tmp_path / "recorded" / f"{number}.npz", **arrays)
+    found = source(tmp_path / "recorded")
+
+    assert found.discrete
+    np.testing.assert_array_equal(found.episode(2).action, [[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0]])
+    assert not found.episode(2).reward.any()
+
+
+def test_a_lower_rate_joins_actions_and_sums_rewards(tmp_path):
+    theirs = recordings.episodes(4)
+    path = recordings.write("lerobot", tmp_path / "recorded", theirs)
+    ours = source(path, proprio=["observation.state"], fps=recordings.FPS / 2).episode(3)  # of 7 steps
+
+    np.testing.assert_array_equal(ours.observation, theirs[3].observation[:7:2])
+    np.testing.assert_array_equal(ours.action[1:], theirs[3].action[1:7].reshape(3, 2))
+    np.testing.assert_array_equal(ours.reward[1:], theirs[3].reward[1:7].reshape(3, 2).sum(1))
+    assert (ours.frames, ours.terminated) == (6, False)
+    with pytest.raises(ForbesError, match="--fps 4 does not divide the 10 steps per second"):
+        source(path, proprio=["observation.state"], fps=4)
+    with pytest.raises(ForbesError, match="--fps 4 needs the rate of the data"):
+        source(recordings.write("dreamer", tmp_path / "dreamer", theirs), fps=4)
+
+
+def test_the_table_says_what_becomes_of_each_key(tmp_path):
+    path = recordings.write("lerobot", tmp_path / "recorded", recordings.episodes(3))
+    found = survey(source(path, proprio=["observation.state"]))
+
+    rows = {row[0]: row[1:] for row in found.rows}
+    assert rows["observation.state"][:3] == ("observation", "(2,)", "float32")
+    assert rows["action"][0] == "action"
+    assert rows["next.reward"][0] == "reward"
+    assert rows["timestamp"] == ("not used", "()", "float32", "")
+    low, high = map(float, rows["action"][3].split(" to "))
+    assert -1 <= low < high <= 1
+    assert "shifted by one" in found.facts["alignment"]
+    assert found.facts["episodes"] == "3, of 4 to 6 steps, 0 terminated"
