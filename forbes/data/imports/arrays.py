@@ -75,14 +75,10 @@ class Arrays(Reader):
     def read(self, number: int, keys: Collection[str]) -> Recorded:
         """Read the steps of an episode."""
         start, end = self._bounds[number].tolist()
-        values, whole = {}, True
-        for key in keys:
-            values[key] = self._arrays[key][start:end]
-            if after := self._after(key):
-                values[key] = np.concatenate([values[key], after[end - 1 : end]])
-            elif key in self.observations:
-                whole = False
-        terminated = whole and bool(self._terminals[end - 1])
+        values = {key: self._arrays[key][start:end] for key in keys}
+        after = {key: found[end - 1 : end] for key in keys if (found := self._after(key))}
+        values |= {key: np.concatenate([values[key], after[key]]) for key in after}
+        terminated = bool(after) and bool(self._terminals[end - 1])
         return Recorded(f"{self._path}: steps {start} to {end - 1}", values, terminated)
 
 

@@ -71,6 +71,7 @@ class Source:
         fps: float | None = None,
     ) -> None:
         self.reader, self.path, self.resize = reader, path, resize
+        self.drops_last = False
         if len(reader) == 0:
             raise ForbesError(f"{path}: there are no episodes. Name another file or folder")
         with readable(path, reader.name, REMEDY):
@@ -129,6 +130,8 @@ class Source:
             else:
                 parts = [_float32(_numbers(recorded, key)) for key in self.keys.proprio]
                 count = len(parts[0])
+                if len(lengths := {len(part) for part in parts}) > 1:
+                    raise ForbesError(f"{recorded.where}: unequal lengths of {self.keys.proprio}: {lengths}. {REMEDY}")
                 observation = np.concatenate([part.reshape(count, -1) for part in parts], axis=1)  # (N, O)
                 observation = observation[:: self.every]  # (n, O)
         return recorded, _Steps(observation, count, action, reward)
@@ -164,6 +167,7 @@ class Source:
                 f"{recorded.where}: its first action is not zero, expected index t to have the action that led to "
                 f"o_t. {REMEDY}"
             )
+        self.drops_last = shift_allowed == 1 and count == len(action)
         kept = (count - 1) // self.every  # T
         used = kept * self.every
         action = self._vectors(recorded, (action[1:] if reader.actions_lead else action)[:used])  # (kT, A)
@@ -191,14 +195,17 @@ class Source:
     def _kind_of_actions(self) -> tuple[bool, int | None]:
         """Return whether actions are discrete, and their number if they are integers."""
         shape, dtype = self.fields[self.keys.action]
-        if dtype.kind not in "iu":
-            sample = map(self._actions, range(min(SAMPLE, len(self))))
-            return all(_one_hot(action[:-1]) for action in sample), None  # the last one may be no action
-        if np.prod(shape, dtype=int) != 1:
-            raise ForbesError(
-                f"{self.path}: {self.keys.action} is {dtype} {shape}, expected one integer or a vector of floats. "
-                "Several discrete actions are not supported"
-            )
+        if dtype.kind not in "iu" or np.prod(shape, dtype=int) != 1:
+            certain = slice(None) if self.reader.actions_lead else slice(-1)  # the last one may be no action
+            sample = [self._actions(number)[certain] for number in range(min(SAMPLE, len(self)))]
+            rows = [action for action in sample if len(action)]
+            discrete = bool(rows) and all(map(_one_hot, rows))
+            if dtype.kind in "iu" and not discrete:
+                raise ForbesError(
+                    f"{self.path}: {self.keys.action} is {dtype} {shape}, expected one integer, a one-hot vector or "
+                    "floats. Several discrete actions are not supported"
+                )
+            return discrete, None
         if (count := self.reader.action_count) is None:
             count = 1 + int(max(self._actions(number).max(initial=1) for number in range(len(self))))
         if count > _MOST:

@@ -61,6 +61,8 @@ def _facts(source: Source, sample: Sequence[Episode]) -> dict[str, str]:
         "action": f"float32 {first.action.shape[1:]}, {_kind(source, sample)}",
         "alignment": _alignment(source),
     }
+    if source.drops_last:
+        facts["last step"] = "dropped: the observation after the last action of an episode is not recorded"
     if source.keys.reward is None:
         facts["reward"] = "0 in all steps, since no key has it (--reward KEY)"
     if source.every > 1:

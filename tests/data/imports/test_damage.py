@@ -110,6 +110,14 @@ def test_an_import_continues_after_the_damaged_file_is_repaired(tmp_path):
     assert len(EpisodeStore(tmp_path / "store").records) == 4
 
 
+def test_several_discrete_actions_are_refused(tmp_path):
+    path = recordings.write("dreamer", tmp_path / "recorded", recordings.episodes(2))
+    for file in path.iterdir():
+        rewrite(file, action=np.tile([[0, 2]], (5, 1)), state=np.ones(5), reward=None, is_first=None, is_terminal=None)
+
+    assert "Several discrete actions are not supported" in sentence_of(path, tmp_path / "store")
+
+
 def test_images_of_floats_are_refused(tmp_path):
     path = recordings.write("dreamer", tmp_path / "recorded", recordings.episodes(2, images=True))
     for file in path.iterdir():

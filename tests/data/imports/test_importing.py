@@ -4,6 +4,8 @@ import multiprocessing
 import os
 import signal
 import tracemalloc
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.data.exports import export_store
 from forbes.data.imports.formats import open_reader
 from forbes.data.imports.importing import import_episodes, is_imported, partial_path
-from forbes.data.imports.source import Source
+from forbes.data.imports.source import SAMPLE, Source
 from forbes.data.imports.survey import survey
 from forbes.errors import ForbesError
 
@@ -168,6 +170,53 @@ def test_integers_become_one_hot_actions(tmp_path):
     assert found.discrete
     np.testing.assert_array_equal(found.episode(2).action, [[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0]])
     assert not found.episode(2).reward.any()
+
+
+def test_an_episode_of_one_step_leaves_actions_one_hot(tmp_path):
+    (tmp_path / "recorded").mkdir()
+    for steps in (1, 3):
+        action = np.concatenate([np.zeros((1, 2)), np.eye(2)[[0, 1, 0][:steps]]])
+        np.savez(tmp_path / "recorded" / f"{steps}.npz", state=np.ones(steps + 1), action=action)
+
+    assert source(tmp_path / "recorded").discrete
+
+
+def test_actions_that_stop_being_one_hot_are_refused(tmp_path):
+    (tmp_path / "recorded").mkdir()
+    for number in range(SAMPLE + 1):
+        action = np.array([[0, 0], [1, 0], [0, 1 if number < SAMPLE else 2]])
+        np.savez(tmp_path / "recorded" / f"{number:02d}.npz", state=np.ones(3), action=action)
+
+    with pytest.raises(ForbesError, match=r"20\.npz: its actions are not one-hot, but those of the first episodes are"):
+        imported(tmp_path / "recorded", tmp_path / "store")
+
+
+def test_parts_of_a_minari_data_set_are_chosen_by_key(tmp_path, monkeypatch):
+    minari, spaces = pytest.importorskip("minari"), pytest.importorskip("gymnasium").spaces
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    image = np.random.default_rng(0).integers(0, 256, (4, 8, 8, 3), np.uint8)
+    parts = {"camera": image, "robot": {"place": np.arange(8.0).reshape(4, 2), "gripper": np.arange(4)}}
+    vectors = {"place": spaces.Box(-9, 9, (2,)), "gripper": spaces.Discrete(4)}
+    observations = spaces.Dict({"camera": spaces.Box(0, 255, (8, 8, 3), np.uint8), "robot": spaces.Dict(vectors)})
+    episode = EpisodeBuffer(
+        0, None, None, parts, np.array([5, 7, 6]), [1.0, 2.0, 3.0], [False] * 3, [False] * 2 + [True]
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that nobody is named as author
+        minari.create_dataset_from_buffers(
+            "lab/toy-v0", [episode], action_space=spaces.Discrete(4, start=5), observation_space=observations
+        )
+
+    with pytest.raises(ForbesError, match="choose --image camera or --proprio robot/gripper or --proprio robot/place"):
+        source(tmp_path / "lab/toy-v0")
+    vector = source(tmp_path / "lab/toy-v0", proprio=["robot/place", "robot/gripper"]).episode(0)
+    np.testing.assert_array_equal(vector.observation, [[0, 1, 0], [2, 3, 1], [4, 5, 2], [6, 7, 3]])
+    np.testing.assert_array_equal(vector.action[1:], np.eye(4)[[0, 2, 1]])
+    by_id = Source(open_reader(Path("lab/toy-v0"), "minari"), Path("lab/toy-v0"), image="camera")
+    np.testing.assert_array_equal(by_id.episode(0).observation, image.transpose(0, 3, 1, 2))
+    assert by_id.describe()["task"] == "toy-v0"
 
 
 def test_a_lower_rate_joins_actions_and_sums_rewards(tmp_path):
