@@ -27,7 +27,7 @@ def import_(
     output: Path,
     format: str | None = None,
     image: str | None = None,
-    proprio: Sequence[str] = (),
+    proprio: Sequence[str] | None = None,
     action: str | None = None,
     reward: str | None = None,
     resize: int | None = None,
@@ -51,7 +51,7 @@ def import_(
     Raises:
         ForbesError: if an episode is damaged, or an option does not fit the data.
     """
-    source = Source(open_reader(Path(path), format), Path(path), image, proprio, action, reward, resize, fps)
+    source = Source(open_reader(Path(path), format), Path(path), image, proprio or (), action, reward, resize, fps)
     _print(source)
     if dry_run:
         return

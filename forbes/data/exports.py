@@ -98,9 +98,10 @@ def _minari(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
     about, (_, first) = _environment(store), _observation(store.episode(next(iter(store.records))))
     limits = (0, 255) if first.dtype == np.uint8 else (-np.inf, np.inf)
     actions = spaces.Discrete(about["action_dim"]) if about["discrete"] else _box(store, spaces)
-    (path / "data").mkdir(parents=True)
+    folder = (path / "data").absolute()  # the library adds a relative path to itself
+    folder.mkdir(parents=True)
     observations = spaces.Box(*limits, first.shape[1:], first.dtype)
-    data = storage.new(path / "data", observations, actions, data_format="hdf5", jpeg_encoding=False)
+    data = storage.new(folder, observations, actions, data_format="hdf5", jpeg_encoding=False)
     data_id = f"{re.sub(r'[^-_a-zA-Z0-9]', '_', name)}-v0"
     data.update_metadata({"dataset_id": data_id, "minari_version": minari.__version__})
 

@@ -183,8 +183,7 @@ class EpisodeWriter(EpisodeStore):
     Entering repairs the traces of a kill: a truncated line of the index, a partial file, and a complete file without
     its line. An index that is lost, or ends in zeros, is rebuilt from the files, with a warning on stderr.
 
-    `append` refuses what could not be read again: other dtypes or ranks than those of `Episode`, values that are not
-    finite, unequal lengths, and an environment that differs from that of the previous episodes.
+    `append` refuses what could not be read again, and episodes of another environment than that of the earlier ones.
 
     Raises:
         ForbesError: on entering, if another process writes to the folder.

@@ -190,7 +190,8 @@ class Source:
                 f"{recorded.where}: its actions are {number.min()} to {number.max()}, expected 0 to "
                 f"{self.action_count - 1}. {REMEDY}"
             )
-        return np.eye(self.action_count, dtype=np.float32)[number]  # (N, A)
+        one_hot: NDArray[np.float32] = np.eye(self.action_count, dtype=np.float32)[number]
+        return one_hot  # (N, A)
 
     def _kind_of_actions(self) -> tuple[bool, int | None]:
         """Return whether actions are discrete, and their number if they are integers."""

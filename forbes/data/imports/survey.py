@@ -12,7 +12,7 @@ from forbes.data.imports.source import SAMPLE, Source
 __all__ = ["Survey", "survey"]
 
 _LEADS = "index t has {} that led to o_t, as in a store"
-_FOLLOWS = "index t has {} that follows o_t: shifted by one, so that index t has what led to o_t"
+_FOLLOWS = "index t has {} after o_t: shifted by one, so that index t has what led to o_t"
 
 
 class Survey(NamedTuple):

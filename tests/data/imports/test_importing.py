@@ -129,7 +129,9 @@ def test_memory_is_that_of_an_episode(tmp_path):
 @pytest.mark.parametrize("images", [False, True], ids=["vectors", "images"])
 @pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
 @pytest.mark.parametrize("name", EXPORTS)
-def test_an_exported_store_is_imported_bit_for_bit(name, discrete, images, tmp_path):
+def test_an_exported_store_is_imported_bit_for_bit(name, discrete, images, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a relative path, as one types it
+    exported = Path("exported")
     pytest.importorskip({"hdf5": "h5py", "minari": "minari"}.get(name, "numpy"))
     random = np.random.default_rng(0)
     about = {"task": "toy", "action_dim": 3, "discrete": discrete}
@@ -146,8 +148,8 @@ def test_an_exported_store_is_imported_bit_for_bit(name, discrete, images, tmp_p
         writer.quarantine(1)
     store = EpisodeStore(tmp_path / "store")
 
-    assert list(export_store(store, tmp_path / "exported", name)) == [0, 1, 2]
-    found = source(tmp_path / "exported")
+    assert list(export_store(store, exported, name)) == [0, 1, 2]
+    found = source(exported)
 
     assert (found.discrete, len(found)) == (discrete, 3)
     for number, ours in zip(store.records, map(found.episode, range(3)), strict=True):
@@ -157,7 +159,7 @@ def test_an_exported_store_is_imported_bit_for_bit(name, discrete, images, tmp_p
             np.testing.assert_array_equal(one, other)
         assert ours.terminated == theirs.terminated
     with pytest.raises(ForbesError, match="exported: exists"):
-        next(export_store(store, tmp_path / "exported", name))
+        next(export_store(store, exported, name))
 
 
 def test_integers_become_one_hot_actions(tmp_path):
