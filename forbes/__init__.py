@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "beliefs": "CategoricalBelief FlowBelief GaussianBelief MixtureBelief",
-    "data": "Experience Replay SequenceBatch SequenceDataModule Simulated Strokes",
+    "data": "Episode EpisodeWriter Experience Replay SequenceBatch SequenceDataModule Simulated Strokes",
     "envs": "DeepMindControl Gymnasium find_environment",
     "errors": "ForbesError",
     "evaluation": "CalibrationError ELBO PLL complete evaluate filter imagine",

@@ -7,6 +7,8 @@ from forbes.beliefs import (
     MixtureBelief as MixtureBelief,
 )
 from forbes.data import (
+    Episode as Episode,
+    EpisodeWriter as EpisodeWriter,
     Experience as Experience,
     Replay as Replay,
     SequenceBatch as SequenceBatch,

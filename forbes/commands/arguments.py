@@ -1,12 +1,13 @@
 """Argument parsing for the commands that Lightning does not parse. Errors are one sentence."""
 
 import argparse
+import math
 from typing import Any, NoReturn
 
 from forbes.choices import LONGEST
 from forbes.errors import ForbesError
 
-__all__ = ["ArgumentParser", "RunsParser", "add_models", "positive", "seconds"]
+__all__ = ["ArgumentParser", "RunsParser", "add_models", "positive", "rate", "seconds"]
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -60,6 +61,17 @@ def positive(text: str) -> int:
     if not text.isascii() or not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
     return int(text)
+
+
+def rate(text: str) -> float:
+    """Parse a positive number of steps per second (an argparse type)."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of steps per second above 0")
+    return value
 
 
 def seconds(text: str) -> float:

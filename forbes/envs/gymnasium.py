@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.envs.base import Environment, Step, repeat, require_repeat
+from forbes.envs.images import to_image
 from forbes.errors import ForbesError
 
 __all__ = ["Gymnasium"]
@@ -88,11 +89,11 @@ class Gymnasium(Environment):
 
     def _observe(self, observation: Any) -> NDArray[Any]:
         if self.pixels:
-            return self._spaces.to_image(self._environment.render(), self.size)
+            return to_image(self._environment.render(), self.size)
         if self.part is not None:
             observation = observation[self.part]
         if self._spaces.is_image(self._seen):
-            return self._spaces.to_image(observation, self.size)
+            return to_image(observation, self.size)
         return self._spaces.flatten(self._seen, observation)
 
     def describe(self) -> dict[str, Any]:
