@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from forbes.envs.base import Environment
 from forbes.envs.dm_control import DeepMindControl
 from forbes.envs.gymnasium import Gymnasium
+from forbes.envs.views import VIEWS, look_through
 from forbes.errors import ForbesError
 
 if TYPE_CHECKING:
@@ -55,7 +56,8 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
 
     Args:
         task: name of the task, one of those in `TASKS`.
-        options: arguments of the environment's constructor.
+        options: arguments of the environment's constructor, and views (`VIEWS`), applied in this order; a view whose
+            value is None is left out, and an argument of the constructor is no view.
 
     Raises:
         ForbesError: if there is no such task or option, or the task would import a module that is not allowed.
@@ -83,10 +85,13 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
         )
     else:
         make = partial(DeepMindControl, task)
-    unknown = options.keys() - inspect.signature(make).parameters.keys()
-    if unknown:
+    known = inspect.signature(make).parameters.keys()
+    views = {name: value for name, value in options.items() if name in VIEWS and name not in known}
+    own = {name: value for name, value in options.items() if name not in views}
+    if unknown := own.keys() - known:
         raise ForbesError(f"{task}: its environment has no option {min(unknown)}. Remove it")
-    return partial(make, **options)
+    make, views = partial(make, **own), {name: value for name, value in views.items() if value is not None}
+    return partial(look_through, make, views) if views else make
 
 
 def _require_known_module(task: str) -> None:

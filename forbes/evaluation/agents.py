@@ -30,7 +30,7 @@ __all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", 
 
 DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
 REWARD = "reward_uncertainty"
-_APART = ("made_by", "shows", "observation_shape")
+_APART = ("made_by", "shows", "views", "observation_shape")
 """Fields in which environments of one task may differ: the rewards do not depend on what the agent is shown."""
 
 
