@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from forbes.envs.base import Environment
@@ -20,13 +21,16 @@ if TYPE_CHECKING:
 __all__ = ["TASKS", "find_environment"]
 
 _GYMNASIUM = "gymnasium:"
+_PACKAGES = ("minigrid", "popgym")
+"""Packages of environments that are extras of this one, and may therefore be imported by name."""
 _HORIZONS = {"mountain_hike": 75, "multi_start_hike": 75, "t_maze": 30, "tiger": 30}
 """Steps per episode as in DVRL, in DPFRL, 3 L as in belief-rnn; that of the tiger is our choice."""
 
 TASKS = f"""\
 {", ".join(_HORIZONS)}: processes with an exact belief
 {_GYMNASIUM}ID: any environment of Gymnasium; for a package that registers its own, with the package's name:
-  {_GYMNASIUM}minigrid:MiniGrid-Empty-5x5-v0; for a module of your own, also with --allow-module MODULE
+  {_GYMNASIUM}minigrid:MiniGrid-MemoryS7-v0, {_GYMNASIUM}popgym:popgym-RepeatPreviousEasy-v0;
+  for a module of your own, also with --allow-module MODULE
 CLASS: an Environment of your own, in a module named by --allow-module
 other: a task of the DeepMind Control Suite as domain_task: cartpole_swingup, ball_in_cup_catch, walker_walk"""
 
@@ -98,11 +102,13 @@ def _require_known_module(task: str) -> None:
     """Refuse `gymnasium:MODULE:ID` if Gymnasium would import an unknown module.
 
     A configuration may come from an untrusted source, and importing a module runs it. Known modules are those imported
-    already, e.g. by --allow-module, and packages that register environments by an entry point.
+    already, e.g. by --allow-module, packages that register environments by an entry point, and our extras.
     """
     module = task.removeprefix(_GYMNASIUM).rpartition(":")[0]
+    if module in _PACKAGES and find_spec(module) is None:
+        raise ForbesError(f"{task}: {module} is not installed. pip install 'forbes[{module}]'")
     registering = {entry.module.partition(".")[0] for entry in entry_points(group="gymnasium.envs")}
-    if module and module not in {*sys.modules, *registering}:
+    if module and module not in {*sys.modules, *registering, *_PACKAGES}:
         raise ForbesError(
             f"{task}: {module} is not a package that registers environments. If you trust it, add: "
             f"--allow-module {module}"
