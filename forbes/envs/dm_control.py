@@ -17,7 +17,7 @@ from forbes.envs.rendering import choose_backend
 from forbes.envs.views import VELOCITIES
 from forbes.errors import ForbesError
 
-__all__ = ["DeepMindControl", "measure"]
+__all__ = ["DeepMindControl", "environment_variable", "measure"]
 
 _NO_RENDERING = "disable"
 """Value of MUJOCO_GL for which dm_control loads no backend."""
@@ -164,7 +164,7 @@ def _load(task: str, backend: str) -> Any:
     Raises:
         ForbesError: if it was imported for another backend, or there is no such task.
     """
-    with _environment_variable("MUJOCO_GL", backend):  # read at the first import
+    with environment_variable("MUJOCO_GL", backend):  # read at the first import
         from dm_control import _render, suite
     if backend not in (_NO_RENDERING, _render.BACKEND):
         raise ForbesError(
@@ -180,7 +180,7 @@ def _load(task: str, backend: str) -> Any:
 
 
 @contextmanager
-def _environment_variable(name: str, value: str) -> Iterator[None]:
+def environment_variable(name: str, value: str) -> Iterator[None]:
     """Set an environment variable inside the `with` block."""
     before = os.environ.get(name)
     os.environ[name] = value

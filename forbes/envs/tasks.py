@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from forbes.envs.base import Environment
 from forbes.envs.dm_control import DeepMindControl
 from forbes.envs.gymnasium import Gymnasium
+from forbes.envs.memory_maze import SIZES, MemoryMaze
 from forbes.envs.views import VIEWS, look_through
 from forbes.errors import ForbesError
 
@@ -28,6 +29,7 @@ _HORIZONS = {"mountain_hike": 75, "multi_start_hike": 75, "t_maze": 30, "tiger":
 
 TASKS = f"""\
 {", ".join(_HORIZONS)}: processes with an exact belief
+memory_maze_SIZE: SIZE is {", ".join(SIZES)}; needs the extra memory-maze
 {_GYMNASIUM}ID: any environment of Gymnasium; for a package that registers its own, with the package's name:
   {_GYMNASIUM}minigrid:MiniGrid-MemoryS7-v0, {_GYMNASIUM}popgym:popgym-RepeatPreviousEasy-v0;
   for a module of your own, also with --allow-module MODULE
@@ -51,6 +53,7 @@ def _open_process(task: str, shows: "Shown" = "observation") -> Environment:
 
 _NAMED: dict[str, Callable[..., Environment]] = {
     **{name: partial(_open_process, name) for name in _HORIZONS},
+    **{f"memory_maze_{size}": partial(MemoryMaze, size) for size in SIZES},
 }
 """Environments of this package by name."""
 

@@ -443,7 +443,7 @@ def test_every_configuration_trains(config, in_tmp_path, screens, vectors):
     name = str(config.relative_to(CONFIGS))
     base = ["--config", f"{CONFIGS}/{OVERLAYS[name]}"] if name in OVERLAYS else []
     elsewhere = {"data.source.origin": "bundled"} if "origin: dejong" in text else {}  # it is not in the repository
-    if name.startswith(("popgym/", "minigrid/")):
+    if name.startswith(("popgym/", "minigrid/", "memory_maze/")):
         pytest.importorskip(config.parent.name)
     if name.startswith("dmc/"):
         elsewhere = {"data.length": 6}

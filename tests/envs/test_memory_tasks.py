@@ -5,6 +5,7 @@ import pytest
 
 from forbes.data.episodes.collection import play, random_policy
 from forbes.envs import find_environment
+from forbes.envs.base import check_step
 from forbes.envs.tasks import _PACKAGES
 from forbes.errors import ForbesError
 
@@ -57,6 +58,19 @@ def test_the_integers_of_minigrid_are_at_most_ten():
     environment = find_environment(MEMORY, part="image")()
 
     assert max(play(environment, random_policy(environment, 0), seed).observation.max() for seed in range(3)) <= 10
+
+
+def test_a_seed_is_a_maze():
+    pytest.importorskip("memory_maze")
+    environment = find_environment("memory_maze_9x9")()
+    one = np.eye(6, dtype=np.float32)[1]
+
+    first, other, again = ([environment.reset(seed), *(environment.step(one) for _ in range(5))] for seed in (1, 2, 1))
+
+    pictures = [np.stack([step.observation for step in steps]) for steps in (first, other, again)]
+    np.testing.assert_array_equal(pictures[0], pictures[2])
+    assert not np.array_equal(pictures[0], pictures[1])
+    check_step(first[-1], (3, 64, 64))
 
 
 def test_a_missing_extra_is_one_sentence(monkeypatch):
