@@ -82,10 +82,9 @@ def test_a_matched_configuration_has_the_parameters_it_claims(config):
     assert abs(own / other - 1) < 0.05
 
 
-def test_the_controlled_comparison_differs_in_the_belief_alone():
-    dreamer, forbes = (
-        yaml.safe_load((CONFIGS / "dmc" / f"{name}.yaml").read_text()) for name in ("dreamer", "forbes_n1")
-    )
+@pytest.mark.parametrize(("gaussian", "flow"), [("dreamer", "forbes_n1"), ("positions/dreamer", "positions/forbes")])
+def test_the_controlled_comparison_differs_in_the_belief_alone(gaussian, flow):
+    dreamer, forbes = (yaml.safe_load((CONFIGS / "dmc" / f"{name}.yaml").read_text()) for name in (gaussian, flow))
 
     beliefs = [config["model"]["init_args"].pop("belief")["class_path"] for config in (dreamer, forbes)]
     assert beliefs == ["GaussianBelief", "FlowBelief"]

@@ -36,7 +36,7 @@ COMMANDS = {
     "runs": Command("list runs and show their curves", "show RUN", "forbes.commands.runs:main"),
     "replay": Command("show where a training diverged", "RUN/failure.pt", "forbes.commands.replay:main"),
     "evaluate": Command("evaluate trained models and compare them", "RUN RUN", "forbes.commands.evaluate:main"),
-    "rollout": Command("record an agent as a GIF", "RUN --video agent.gif", "forbes.commands.rollout:main"),
+    "rollout": Command("record an agent as a GIF or MP4", "RUN --video agent.gif", "forbes.commands.rollout:main"),
     "beliefs": Command("compare learned beliefs with exact ones", "RUN RUN", "forbes.commands.beliefs:main"),
     "theorem": Command("check Theorem 1 in closed form", "--steps 30", "forbes.commands.theorem:main"),
     "compare": Command(

@@ -10,7 +10,7 @@ from forbes.envs.base import finite_bounds, scale_action
 from forbes.envs.images import CHANNELS
 from forbes.errors import ForbesError
 
-__all__ = ["flatten", "is_image", "require_actions", "require_observations", "to_action"]
+__all__ = ["flatten", "is_image", "require_actions", "require_observations", "sizes", "to_action"]
 
 _FLAT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _REGISTER = "Wrap and register it in a module of your own, and use: gymnasium:MODULE:ID"
@@ -42,6 +42,15 @@ def flatten(space: Any, value: Any) -> NDArray[np.float32]:
         bounded = np.isfinite(high - low)
         flat = np.where(bounded, (flat - low) / np.where(bounded & (high > low), high - low, 1), flat)
     return flat.astype(np.float32)
+
+
+def sizes(space: Any) -> dict[str, int]:
+    """Return how many numbers `flatten` makes of each entry of a Dict; of another space, nothing."""
+    entries = space.spaces if isinstance(space, spaces.Dict) else {}
+    return {
+        str(name): sum(0 if _is_text(leaf) else spaces.flatdim(leaf) for leaf in _parts(entry))
+        for name, entry in entries.items()
+    }
 
 
 def require_observations(task: str, space: Any) -> None:

@@ -1,10 +1,11 @@
 """The arguments of `forbes data …`, and the functions that run its commands."""
 
 import argparse
+import functools
 import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from forbes.choices import EXPORTS, FORMATS, Dataset, Fetched, Origin, Split
 from forbes.commands.arguments import ArgumentParser, positive, rate, seconds
@@ -134,10 +135,38 @@ def _add_collect(of_data: _Parser) -> None:
     play.add_argument(
         "--fast", action="store_const", const=True, help="in DeepMind Control: no shadows, which changes the pixels"
     )
+    _add_views(play)
     play.add_argument(
         "--time-limit", type=positive, metavar="STEPS", help="truncate longer episodes (default: 100,000)"
     )
     play.add_argument("--timeout", type=seconds, help="seconds to wait for the environment (default: 60)")
+
+
+def _add_views(play: argparse.ArgumentParser) -> None:
+    """Add the options that make a task less observable."""
+    group = play.add_argument_group("less observable", "applied in the order in which they are given")
+    add = functools.partial(group.add_argument, action=_InOrder)
+    names = "names of parts, e.g. velocities, or indices from 0"
+    add("--hide", nargs="+", type=_part, metavar="PART", help=f"leave out dimensions of vectors: {names}")
+    add("--flicker", type=float, metavar="P", help="blank each observation with probability P")
+    sides = ("LEFT", "TOP", "RIGHT", "BOTTOM")
+    add("--occlude", nargs=4, type=float, metavar=sides, help="blank a box of each image, in fractions of its size")
+    add("--noise", type=float, metavar="STD", help="add Gaussian noise; for images, as a fraction of white")
+    add("--delay", type=int, metavar="STEPS", help="show each observation so many agent steps late")
+    add("--blank-until", type=int, metavar="STEPS", help="blank the first observations of each episode")
+
+
+class _InOrder(argparse.Action):
+    """Stores values so that the order of the arguments is that of the namespace."""
+
+    def __call__(self, parser: object, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        """Move the argument to the end of the namespace."""
+        vars(namespace).pop(self.dest, None)
+        setattr(namespace, self.dest, values)
+
+
+def _part(text: str) -> str | int:
+    return int(text) if text.isdecimal() else text
 
 
 def _add_episodes(of_data: _Parser) -> None:
