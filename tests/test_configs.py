@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import forbes.training  # noqa: F401  # a configuration finds its classes by their short names once they are imported
 from forbes.runs.configuration import allow_modules, experiment_parser
 
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -72,6 +72,7 @@ def test_the_state_is_that_of_the_exit_status(status, state, tmp_path, capsys):
         ("process 1 on another", "running"),  # its metrics are seconds old
         ("", "failed"),
     ],
+    ids=["here", "ended", "elsewhere", "unlocked"],  # not the number, which differs between the workers of pytest-xdist
 )
 def test_a_run_without_an_end_runs_while_its_process_is_alive(owner, state, tmp_path, capsys):
     (write(tmp_path / "runs" / "a") / ".lock").write_text(owner)
