@@ -11,12 +11,12 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "beliefs": "CategoricalBelief FlowBelief GaussianBelief MixtureBelief",
-    "data": "Experience Replay SequenceBatch SequenceDataModule Simulated Strokes",
+    "data": "Episode EpisodeWriter Experience Replay SequenceBatch SequenceDataModule Simulated Strokes",
     "envs": "DeepMindControl Gymnasium find_environment",
     "errors": "ForbesError",
     "evaluation": "CalibrationError ELBO PLL complete evaluate filter imagine",
-    "models": "Bernoulli ConvDecoder ConvEncoder MLPDecoder MLPEncoder ModelParts Normal OneHot OnePixel "
-    "ParticleModel PixelDecoder PixelEncoder StateSpaceModel SymlogNormal VectorModel VectorNormal",
+    "models": "Bernoulli ConvDecoder ConvEncoder MLPDecoder MLPEncoder ModelAdapter ModelParts Normal OneHot "
+    "OnePixel ParticleModel PixelDecoder PixelEncoder State StateSpaceModel SymlogNormal VectorModel VectorNormal",
     "pomdps": "LightDark LinearGaussian MirrorSensor MountainHike TMaze Tiger Ungm",
     "training": "ImaginationActorCritic KnownBelief PlanningAgent WorldModel",
     "training.loading": "load_run",

@@ -7,6 +7,8 @@ from forbes.beliefs import (
     MixtureBelief as MixtureBelief,
 )
 from forbes.data import (
+    Episode as Episode,
+    EpisodeWriter as EpisodeWriter,
     Experience as Experience,
     Replay as Replay,
     SequenceBatch as SequenceBatch,
@@ -31,6 +33,7 @@ from forbes.models import (
     ConvEncoder as ConvEncoder,
     MLPDecoder as MLPDecoder,
     MLPEncoder as MLPEncoder,
+    ModelAdapter as ModelAdapter,
     ModelParts as ModelParts,
     Normal as Normal,
     OneHot as OneHot,
@@ -38,6 +41,7 @@ from forbes.models import (
     ParticleModel as ParticleModel,
     PixelDecoder as PixelDecoder,
     PixelEncoder as PixelEncoder,
+    State as State,
     StateSpaceModel as StateSpaceModel,
     SymlogNormal as SymlogNormal,
     VectorModel as VectorModel,

@@ -37,6 +37,7 @@ KINDS = {
     "RSSM": partial(WorldModel),
     "FORBES": partial(WorldModel, **FLOW, kl="monte_carlo"),
     "much below its free nats": partial(WorldModel, free_nats=50.0),
+    "not finite in one row": partial(WorldModel),
     "free nats of each step": partial(WorldModel, free_nats_per="element"),
     "categorical": partial(WorldModel, belief=partial(CategoricalBelief, classes=3)),
     "particles": partial(WorldModel, model=partial(ParticleModel, particles=TRAJECTORIES)),
@@ -61,6 +62,9 @@ class Unequal(SequenceSource):
 
     observation_shape, action_dim = (2,), 2
 
+    def __init__(self, broken_row=None):
+        self.broken_row = broken_row
+
     def sha256(self):
         return ""
 
@@ -73,7 +77,10 @@ class Unequal(SequenceSource):
     def gather(self, split, index, length):
         rows = [torch.Generator().manual_seed(row) for row in index.tolist()]
         draws = [torch.randn(length, 6, generator=row, dtype=torch.float32) for row in rows]
-        return torch.stack(draws) if draws else torch.zeros(0, length, 6, dtype=torch.float32), index % BATCH
+        numbers = torch.stack(draws) if draws else torch.zeros(0, length, 6, dtype=torch.float32)
+        if split == "train":
+            numbers[index == self.broken_row] = torch.nan
+        return numbers, index % BATCH
 
     def decode(self, compact):
         numbers, row = compact
@@ -116,10 +123,10 @@ def build(kind):
 
 def train(kind, ranks):
     """Return what the updates gave, the validation's metrics, and the weights in the end."""
-    known = kind == "known process"
+    known, broken = kind == "known process", 2 * BATCH - 1 if kind == "not finite in one row" else None
     torch.set_default_dtype(torch.float32 if known else torch.float64)  # that of what is logged, too
     try:
-        source = Simulated(MirrorSensor(), train=9 * BATCH, validation=9 * BATCH) if known else Unequal()
+        source = Simulated(MirrorSensor(), train=9 * BATCH, validation=9 * BATCH) if known else Unequal(broken)
         kind_of_data = SequenceDataModule if known else DoubleBatches
         data = kind_of_data(source, BATCH, STEPS, UPDATES, validation_sequences=9 * BATCH)
         module, recorder = build(kind), Recorder()

@@ -36,6 +36,8 @@ class Collect(Callback):
     one epoch older than without `overlap`, but just as reproducible. No other episode is played at the same time, since
     two processes that render on one GPU can deadlock.
 
+    Of the processes of one training, the first plays and stores all episodes, while the others wait for it.
+
     Logs at the end of an epoch: `env_steps` (simulator frames, including action repeat), `agent_steps`, and
     `return/exploring` of the newest episode. Every `evaluate_every` epochs also, over episodes without exploration that
     are not used for training, the mean `return/acting` and `reward_explained/5`, the R² of the rewards predicted 5
@@ -68,7 +70,11 @@ class Collect(Callback):
         require_agent(self, trainer, pl_module)
         self._estimated = False
         if stage == "fit":
-            _experience(trainer).open(Path(trainer.default_root_dir) / "episodes")
+            source, folder = _experience(trainer), Path(trainer.default_root_dir) / "episodes"
+            if trainer.is_global_zero:
+                source.open(folder)
+            else:
+                source.followed = folder
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Close the store and the environment."""
@@ -82,12 +88,21 @@ class Collect(Callback):
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play the missing episodes."""
         source, agent = _experience(trainer), cast(WorldModelAgent, pl_module)
+        steps = self._play(trainer, source, agent) if trainer.is_global_zero else {}
+        steps = trainer.strategy.broadcast(steps)
+        if not trainer.is_global_zero:
+            source.follow()
+        agent.log_dict(steps, on_step=False, on_epoch=True, batch_size=1)
+
+    def _play(self, trainer: Trainer, source: Experience, agent: WorldModelAgent) -> dict[str, float]:
+        """Play the missing episodes, and return what is logged of them."""
         if trainer.current_epoch == 0:  # without a checkpoint, keep only the valid seed episodes of an earlier start
             source.watermark = source.begun("random", agent.seed, self.seed_episodes)
         else:  # a run resumed from the checkpoint would not sample from the episodes deleted now
             source.forget()
         for record in source.collect(self.seed_episodes, random_policy, "random", agent.seed):
-            _print(trainer, f"seed episode {record.number + 1}/{self.seed_episodes}: return {record.total_reward:.1f}")
+            played = f"seed episode {record.number + 1}/{self.seed_episodes}"
+            print(f"{played}: return {record.total_reward:.1f}", flush=True)
         with _eval_mode(agent):
             until = self.seed_episodes + trainer.current_epoch
             list(source.collect(until, AgentPolicy(agent, exploring=True), type(agent).__name__, agent.seed))
@@ -96,7 +111,7 @@ class Collect(Callback):
         steps = {"env_steps": float(source.env_steps), "agent_steps": float(source.agent_steps)}
         if source.newest.number >= self.seed_episodes:
             steps["return/exploring"] = source.newest.total_reward
-        agent.log_dict(steps, on_step=False, on_epoch=True, batch_size=1)
+        return steps
 
     def _estimate_room(self, trainer: Trainer) -> None:
         """Warn in the first epoch of this process if the disk is too small for the remaining episodes."""
@@ -107,25 +122,29 @@ class Collect(Callback):
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         """Start the next episode in the background, after other callbacks have played theirs."""
-        if self.overlap and batch_idx == 0:
+        if self.overlap and batch_idx == 0 and trainer.is_global_zero:
             agent = cast(WorldModelAgent, pl_module)
             _experience(trainer).begin(AgentPolicy.as_it_is(agent, exploring=True), agent.seed)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Store the episode played in the background; evaluate the agent every few epochs, and at the end."""
         agent, source = cast(WorldModelAgent, pl_module), _experience(trainer)
-        if self.overlap:
+        if self.overlap and trainer.is_global_zero:
             source.finish(type(agent).__name__, agent.seed)
         epoch = trainer.current_epoch + 1
         if epoch % self.evaluate_every and epoch != trainer.max_epochs:
             return
+        measured = self._evaluate(trainer, agent) if trainer.is_global_zero else {}
+        agent.log_dict(trainer.strategy.broadcast(measured), batch_size=1)
+
+    def _evaluate(self, trainer: Trainer, agent: WorldModelAgent) -> dict[str, float]:
+        """Play the evaluation episodes, and return what is logged of them."""
         with _eval_mode(agent):
             played = [self.evaluation_episode(trainer, agent, k) for k in range(self.evaluation_episodes)]
             predicted = [self._predict_rewards(agent, episode, k) for k, episode in enumerate(played)]
-        agent.log("return/acting", sum(episode.total_reward for episode in played) / len(played), batch_size=1)
         r2 = r2_score(predicted, [torch.from_numpy(episode.reward[1:]).double() for episode in played])
-        if r2 is not None:
-            agent.log(f"reward_explained/{_AHEAD}", r2, batch_size=1)
+        mean = sum(episode.total_reward for episode in played) / len(played)
+        return {"return/acting": mean} | ({} if r2 is None else {f"reward_explained/{_AHEAD}": r2})
 
     @staticmethod
     def _predict_rewards(agent: WorldModelAgent, episode: Episode, number: int) -> Tensor:
@@ -165,8 +184,3 @@ def require_agent(callback: Callback, trainer: Trainer, module: LightningModule)
     if not (isinstance(source, Experience) and isinstance(module, WorldModelAgent)):
         name, found = type(callback).__name__, f"{type(module).__name__} on {type(source).__name__}"
         raise ForbesError(f"{name}: found a {found}, expected an agent on Experience. Remove it, or change them")
-
-
-def _print(trainer: Trainer, line: str) -> None:
-    if trainer.is_global_zero:
-        print(line, flush=True)

@@ -33,8 +33,8 @@ class CudaGraph(Callback):
         tf32: whether the update multiplies float32 matrices with 10 bits of their mantissas (three digits); faster.
 
     Raises:
-        ForbesError: if the module is not a WorldModel, `kl_warmup` is set (the loss would change between replays), the
-            update synchronises with the host, or there is no triton or C compiler.
+        ForbesError: if the module is not a WorldModel, several processes train, `kl_warmup` is set (the loss would
+            change between replays), the update synchronises with the host, or there is no triton or C compiler.
     """
 
     def __init__(self, tf32: bool = False) -> None:
@@ -45,6 +45,11 @@ class CudaGraph(Callback):
         if not isinstance(pl_module, WorldModel):
             name = type(pl_module).__name__
             raise ForbesError(f"CudaGraph: found a {name}, expected a WorldModel or an agent. Leave CudaGraph out")
+        if trainer.world_size > 1:
+            raise ForbesError(
+                f"CudaGraph: records an update of one process, but {trainer.world_size} share every batch. Leave "
+                "CudaGraph out"
+            )
         if pl_module.kl_warmup:
             raise ForbesError("CudaGraph: kl_warmup changes the loss between updates, expected 0. Leave one out")
 

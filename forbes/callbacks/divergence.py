@@ -68,7 +68,8 @@ class StopAtDivergence(Callback):
         if math.isinf(held):
             return
         update = int(held)
-        AtomicCheckpointIO().save_checkpoint(_failure_record(trainer, module, update), self.run.failure)
+        if trainer.is_global_zero:
+            AtomicCheckpointIO().save_checkpoint(_failure_record(trainer, module, update), self.run.failure)
         command = f"forbes fit --resume {self.run}" if self.run.checkpoint.exists() else "the same command"
         raise DivergedError(
             f"{self.run}: diverged, the loss or gradient of update {update + 1} is not finite. See where: "
@@ -87,6 +88,7 @@ def _failure_record(trainer: Trainer, module: LightningModule, update: int) -> d
     return {
         "update": update,
         "seed": getattr(module, "seed", None),
+        "processes": trainer.world_size,
         "device": module.device.type,
         "precision": trainer.precision,
         "state_dict": module.state_dict(),

@@ -39,7 +39,7 @@ class ElboCurve(PictureCallback):
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """Draw the curves."""
-        metrics = read_metrics(str(trainer.log_dir))
+        metrics = read_metrics(self.folder)
         names = [module.objective_name, *module.model.logged_terms]
         has_kl, colour = "kl" in names, colour_of(module.model)
         with paper_style():

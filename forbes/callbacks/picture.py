@@ -46,6 +46,8 @@ class FileCallback(Callback, ABC):
 
     filename: str
     """Name of the file in `figures/`."""
+    folder: Path
+    """The run folder, while the file is written. `trainer.log_dir` is collective, and only one process writes."""
 
     def __init__(self, every: int = 5) -> None:
         require_at_least(1, type(self).__name__, every=every)
@@ -68,8 +70,9 @@ class FileCallback(Callback, ABC):
         folder = trainer.log_dir  # a collective operation, so every process must call it
         if folder is None or not trainer.is_global_zero:
             return
+        self.folder = Path(folder)
         with _own_randomness(module, self.filename):
-            path = Path(folder) / "figures" / self.filename
+            path = self.folder / "figures" / self.filename
             self.write(trainer, cast(WorldModel, module), datamodule_of(trainer), path)
         for logger in trainer.loggers:
             if shows(logger, self.filename):

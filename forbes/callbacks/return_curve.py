@@ -44,7 +44,7 @@ class ReturnCurve(PictureCallback):
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """Draw the returns."""
         task, published = self._published(data)
-        return return_curve(read_metrics(str(trainer.log_dir)), task, published)
+        return return_curve(read_metrics(self.folder), task, published)
 
     def _published(self, data: SequenceDataModule) -> tuple[str, dict[str, list[pd.Series]]]:
         """Return the task, and its published curves."""

@@ -4,6 +4,7 @@ import argparse
 import difflib
 import importlib
 import itertools
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -32,9 +33,10 @@ COMMANDS = {
     "configs": Command(
         "list, show and copy configurations", "copy strokes/forbes mine.yaml", "forbes.commands.configs:main"
     ),
+    "runs": Command("list runs and show their curves", "show RUN", "forbes.commands.runs:main"),
     "replay": Command("show where a training diverged", "RUN/failure.pt", "forbes.commands.replay:main"),
     "evaluate": Command("evaluate trained models and compare them", "RUN RUN", "forbes.commands.evaluate:main"),
-    "rollout": Command("record an agent as a GIF", "RUN --video agent.gif", "forbes.commands.rollout:main"),
+    "rollout": Command("record an agent as a GIF or MP4", "RUN --video agent.gif", "forbes.commands.rollout:main"),
     "beliefs": Command("compare learned beliefs with exact ones", "RUN RUN", "forbes.commands.beliefs:main"),
     "theorem": Command("check Theorem 1 in closed form", "--steps 30", "forbes.commands.theorem:main"),
     "compare": Command(
@@ -122,10 +124,18 @@ def _run(arguments: list[str]) -> int:
             print(page, end="")
             return 0
     else:  # help and wrong arguments are reported before anything heavy is imported
+        _require_one_process(name)
         _parser(name).parse_args(list(itertools.takewhile("--".__ne__, rest)))
     module, function = COMMANDS[name].target.split(":")
     command: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
     return command(rest) or 0
+
+
+def _require_one_process(name: str) -> None:
+    """Refuse a command that several processes would each do as a whole."""
+    processes = int(os.environ.get("WORLD_SIZE", 1)) if "TORCHELASTIC_RUN_ID" in os.environ else 1
+    if processes > 1:
+        raise ForbesError(f"forbes {name}: uses one process, but torchrun started {processes}. Leave torchrun out")
 
 
 def _asked_help(name: str, arguments: list[str]) -> str | None:

@@ -15,8 +15,8 @@ from forbes.commands.parsers.compare import parser
 from forbes.commands.trainings import Training, training_job
 from forbes.errors import ForbesError
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
-from forbes.evaluation.record import read_record
-from forbes.evaluation.runs import load_runs
+from forbes.evaluation.record import read_record, require_readable, results_folders
+from forbes.evaluation.runs import find_device, load_runs
 from forbes.figures.comparison import draw_differences, draw_per_step, draw_scores
 from forbes.figures.style import save_png_and_pdf
 from forbes.files import replace_file
@@ -53,7 +53,9 @@ def main(argv: Sequence[str]) -> None:
         if not _is_measured(run, metrics.has, args.seed)
     ]
     if missing:
-        evaluate(missing, args, command)
+        folders_of = results_folders(missing)
+        require_readable(folders_of.values())
+        evaluate(load_runs(missing, find_device(args.device)), args, command, folders_of)
     comparison = compare(families, [name for name in wanted[0].names if any(name in metrics.has for metrics in wanted)])
     _write(comparison, families, args.output, command)
 

@@ -14,10 +14,11 @@ from forbes.commands.parsers.completions import parser
 from forbes.data import Strokes
 from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, load_classifiers
 from forbes.errors import ForbesError
+from forbes.evaluation.adapters import load_all
 from forbes.evaluation.digits.completions import select_prefixes
 from forbes.evaluation.digits.study import Row, Study, entries, study
 from forbes.evaluation.estimates import Estimate
-from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, require_comparable, run_titles
+from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, require_comparable, run_titles
 from forbes.figures.completions import by_ambiguity, draw_class_scores, draw_completions, draw_errors
 from forbes.figures.style import save_png_and_pdf
 from forbes.files import replace_file
@@ -31,7 +32,7 @@ _DRAWN = 10  # digits per figure
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
-    runs = load_runs(args.runs)
+    runs = load_all(args.runs, args.model, args.data, needs=("sample", "mean"))
     _check(args, runs)
     data = runs[0].data
     hashes = [data_sha256(run.data, args.split, args.sequences) for run in runs]

@@ -21,6 +21,7 @@ from forbes.commands.tables import (
 )
 from forbes.data import Simulated
 from forbes.errors import ForbesError
+from forbes.evaluation.adapters import adapter_folder, load_all
 from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.image_scores import futures_of, image_curves, image_rows, score_images
@@ -33,7 +34,6 @@ from forbes.evaluation.runs import (
     data_name,
     data_sha256,
     find_device,
-    load_runs,
     require_comparable,
     split_batches,
 )
@@ -65,11 +65,18 @@ def main(argv: Sequence[str]) -> None:
     for run, folder in folders.items():
         if folder != RunFolder(run).results:
             print(f"the results of {run} go to {folder}", flush=True)
-    if is_agent(args.runs[0]):
+    if args.runs and is_agent(args.runs[0]):
+        if args.model:
+            raise ForbesError(f"{args.runs[0]}: an agent is evaluated by its return, a --model has none. Name others")
         device = find_device(args.device)
         played = evaluate_agents(folders, args.episodes, args.acting_samples, args.seed, device, command)
         return print_agents(played)
-    measured = evaluate(args.runs, args, command, folders)
+    for words in args.model:
+        folders[" ".join(words)] = adapter_folder(words, args.output)
+        print(f"the results of {' '.join(words)} go to {adapter_folder(words, args.output)}", flush=True)
+    require_readable(folders.values())
+    runs = load_all(args.runs, args.model, args.data, find_device(args.device))
+    measured = evaluate(runs, args, command, folders)
     print_runs(measured)
     print_references(measured)
     if len(measured) > 1:
@@ -78,20 +85,15 @@ def main(argv: Sequence[str]) -> None:
     print_images(measured)
 
 
-def evaluate(
-    paths: Sequence[str], args: Any, command: str, folders: Mapping[str, Path] | None = None
-) -> list[EvaluatedRun]:
+def evaluate(runs: Sequence[TrainedRun], args: Any, command: str, folders: Mapping[str, Path]) -> list[EvaluatedRun]:
     """Evaluate runs on the same sequences and record the results.
 
     Args:
-        paths: run folders.
+        runs: runs, or models trained elsewhere.
         args: parsed options of `forbes.commands.parsers.evaluate.add_score_options`.
         command: command line, for the record.
-        folders: folder for the record of each run. Default: the run folder itself.
+        folders: folder for the record of each run, by its path.
     """
-    folders = folders or results_folders(paths)
-    require_readable(folders.values())
-    runs = load_runs(paths, find_device(args.device))
     jobs, code = _jobs(args, runs), commit()
     finished: list[PartialScores] = []
     measured = []
@@ -139,7 +141,10 @@ def _image_entries(run: TrainedRun, jobs: Sequence[_Job], number: int, args: Any
     began, futures = time.monotonic(), futures_of(run.model, args.futures)
     batches = split_batches(run.data, args.split, job.sequences, image_rows(run.data.length - args.context))
     batches = with_progress(batches, f"{run.path} images", job.sequences)
-    found = score_images(run.model, run.data.source, batches, args.context, futures, args.seed)
+    try:
+        found = score_images(run.model, run.data.source, batches, args.context, futures, args.seed)
+    except NotImplementedError:  # the likelihood of an adapter may have no mean
+        return {}
     about = {"sequences": job.sequences, **_about(run, job.sha256[number], began)}
     job = job._replace(score=job.score._replace(tag=f"K={futures},c={args.context}"))
     return {
@@ -190,8 +195,8 @@ def _require_scores(runs: Sequence[TrainedRun], scorers: Mapping[str, Scorer], n
     """Refuse scores that no model has, and numbers of particles or futures that a model cannot use."""
     if not any(scorer.of(run.model).metrics for run in runs for scorer in scorers.values()):
         raise ForbesError(
-            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(scorers)} score, its likelihood is exact. "
-            "Ask for --scores pll or open-loop"
+            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(scorers)} score, since it has no density "
+            "of a posterior. Ask for --scores pll or open-loop"
         )
     for run, name in itertools.product(runs, ("pll", "open-loop")):
         if name in numbers:

@@ -23,9 +23,9 @@ def main(argv: Sequence[str]) -> None:
             raise ForbesError("forbes figures list: it draws nothing, so it has no options. Name a figure instead")
         console(80).print(_table())
         return
-    if not args.runs:
+    if not args.runs and not args.model:
         raise ForbesError(f"forbes figures {args.name}: no runs to draw. Name some: --runs RUN")
-    print(*draw(args.name, args.runs, args.output, **options), sep="\n")
+    print(*draw(args.name, args.runs or [], args.output, **options), sep="\n")
 
 
 def _given(args: argparse.Namespace) -> dict[str, object]:

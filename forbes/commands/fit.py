@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jsonargparse import DefaultHelpFormatter
@@ -24,12 +24,12 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 import forbes.callbacks  # registers their short names for configurations
-from forbes.bundled import is_pretrained
 from forbes.callbacks.divergence import StopAtDivergence
 from forbes.callbacks.picture import FileCallback
+from forbes.commands.fit_options import FitOptions
 from forbes.commands.lower_rate import MOST, LowerRateError, at_half_the_rate
 from forbes.commands.parsers.fit import DESCRIPTION, run_options
-from forbes.commands.trainer_arguments import require_usable
+from forbes.commands.trainer_arguments import require_processes, require_usable
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.runs.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
@@ -39,11 +39,11 @@ from forbes.runs.configuration import (
     add_links,
     add_seed,
     allow_modules,
-    changed_defaults,
     data_paths,
     require_classes,
 )
-from forbes.runs.folder import RunFolder, experiment_name, read_config
+from forbes.runs.folder import RunFolder, experiment_name
+from forbes.runs.launched import EndTogether, chosen_by_first, is_first, launched_devices, lost_process
 from forbes.runs.loggers import ParserOfRuns, open_logger, shows
 from forbes.runs.metrics_log import JsonLinesLogger, MarkStart
 from forbes.runs.modules import check_weights, weights_of
@@ -64,6 +64,7 @@ _NOT_OURS = (  # warnings that do not apply here
     ".*`IterableDataset` has `__len__` defined.*",  # there are no workers
     ".*You requested to overfit but enabled .* dataloader shuffling.*",  # the batches are not shuffled
     ".*smaller than the logging interval.*",  # the interval counts updates, not epochs
+    ".*recommended to use `self.log.*sync_dist=True.*",  # the values are those of all processes
     ".*treespec, LeafSpec.*",  # Lightning 2.6 calls torch 2.13 the old way
     "(?s).*JsonargparseDeprecationWarning",  # and jsonargparse 4.53
     "(?s).*instantiate_classes",
@@ -121,35 +122,6 @@ def _run(command: str, arguments: Sequence[str]) -> int:
             raise
 
 
-class _FitOptions(NamedTuple):
-    """Options of `fit` that are not part of the configuration."""
-
-    experiment: str | None = None
-    """Name of the experiment."""
-    run_dir: str | None = None
-    """Path of the run folder."""
-    resumed: RunFolder | None = None
-    """Run folder to resume."""
-    on_divergence: str = "stop"
-    """What to do after a divergence: stop or lower-rate."""
-
-    @classmethod
-    def parse(cls, arguments: Sequence[str]) -> tuple["_FitOptions", list[str]]:
-        """Return the options, and the arguments of the configuration, after those of a resumed run."""
-        options, rest = run_options().parse_known_args(arguments)
-        for option in ("resume", "run_dir"):
-            if (folder := getattr(options, option)) and folder.endswith(".ckpt"):
-                raise ForbesError(f"--{option} {folder}: is a checkpoint, expected a run folder")
-            if folder and is_pretrained(folder):
-                raise ForbesError(f"--{option} {folder}: comes with the package, expected a folder that can be written")
-        if not options.resume:
-            return cls(options.experiment, options.run_dir, None, options.on_divergence), rest
-        run = RunFolder.trained(options.resume)
-        older = changed_defaults(read_config(run.config))
-        flags = [part for key, value in older.items() for part in (f"--{key}", str(value))]
-        return cls(resumed=run, on_divergence=options.on_divergence), ["--config", str(run.config), *flags, *rest]
-
-
 class _Help(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter):
     """Help formatter that keeps the line breaks of the run folder's options."""
 
@@ -167,9 +139,10 @@ class _Experiment(LightningCLI):
     def __init__(self, command: str, arguments: Sequence[str], with_paths: Sequence[str], stack: ExitStack) -> None:
         self.command, self.arguments, self.with_paths, self.stack = command, arguments, with_paths, stack
         self.stop: StopOnSignal | None = None
-        self.options, configuration = _FitOptions(), list(with_paths)
+        self.together: EndTogether | None = None
+        self.options, configuration = FitOptions(), list(with_paths)
         if command == "fit":
-            self.options, configuration = _FitOptions.parse(with_paths)
+            self.options, configuration = FitOptions.parse(with_paths)
         super().__init__(
             model_class=LightningModule,
             datamodule_class=SequenceDataModule,
@@ -211,6 +184,8 @@ class _Experiment(LightningCLI):
             self.config = parser.parse_args(args)
         for section in ("model", "data", "trainer"):
             require_classes(self.config[section], section)
+        if launched := launched_devices():
+            self.config["trainer"]["devices"], self.config["trainer"]["num_nodes"] = launched
         data = self.config["data"]
         for key, path in data_paths(data).items():
             data[key] = str(Path(path).absolute())
@@ -229,6 +204,7 @@ class _Experiment(LightningCLI):
         """Build the trainer. For `fit`, open the run folder and add the callbacks and loggers that write to it."""
         config = self.config_init["trainer"]
         require_usable(config, self.model, self.datamodule)
+        require_processes(config, self.command, self.options.on_divergence)
         callbacks, plugins = _as_list(config["callbacks"]), _as_list(config["plugins"])
         if config["enable_progress_bar"] is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(progress())
@@ -244,22 +220,23 @@ class _Experiment(LightningCLI):
     def _run_arguments(self, config: Any, callbacks: list[Any]) -> dict[str, Any]:
         """Open the run folder, add the callbacks that write to it, and return the trainer's arguments that name it."""
         run = self._open_run()
-        print(f"run folder: {run}", flush=True)
-        self.stop = StopOnSignal(run)
+        if is_first():
+            print(f"run folder: {run}", flush=True)
+        self.stop, self.together = StopOnSignal(run), EndTogether(run)
         self.save_config_kwargs = {"run": run, "stop": self.stop, "arguments": [self.command, *self.arguments]}
-        callbacks += [ResumeWholeEpochs(), MarkStart(), self.stop, StopAtDivergence(run)]
+        callbacks += [ResumeWholeEpochs(), MarkStart(), self.stop, self.together, StopAtDivergence(run)]
         if config["enable_checkpointing"] is not False:
             callbacks.append(SaveLast(run))
         loggers = config["logger"]
         if loggers is not False:
             named = _as_list(None if loggers is True else loggers)
-            opened = [open_logger(logger, run.path) for logger in named]
+            opened = [open_logger(logger, run.path) for logger in named if is_first()]
             _tell_hidden_pictures(opened, callbacks, run)
             loggers = [JsonLinesLogger(run.metrics), *opened]
         return {"logger": loggers, "default_root_dir": config["default_root_dir"] or run.path}
 
     def _open_run(self) -> RunFolder:
-        """Create the run folder, or use the one that was named, and lock it."""
+        """Create the run folder, or use the one that was named; the first process of a training locks it."""
         options = self.options
         if options.resumed:
             run = options.resumed
@@ -267,7 +244,10 @@ class _Experiment(LightningCLI):
             run = RunFolder(options.run_dir)
         else:
             experiment = options.experiment or experiment_name([str(path) for path in self.config["config"] or []])
-            run = RunFolder.new(experiment, time.strftime("%Y%m%d-%H%M%S"), self.config["seed_everything"])
+            started, seed = time.strftime("%Y%m%d-%H%M%S"), self.config["seed_everything"]
+            run = RunFolder(chosen_by_first(lambda: str(RunFolder.new(experiment, started, seed))))
+        if not is_first():
+            return run
         self.stack.enter_context(run.locked())
         if not options.resumed and run.checkpoint.exists():
             raise ForbesError(f"{run}: holds a trained run. Name another, or resume it: forbes fit --resume {run}")
@@ -290,15 +270,25 @@ class _Experiment(LightningCLI):
             how["verbose"] = False  # Lightning's table would drop text in brackets
         try:
             found = getattr(self.trainer, self.command)(self.model, **how)
+        except RuntimeError as error:
+            if self.together is None or not lost_process(error):
+                raise
+            raise ForbesError(self.together.sentence()) from error
         except DivergedError as error:
+            if not is_first():  # it says so
+                return 0
             if self.options.on_divergence == "stop" or self.stop is None or self.stop.received is not None:
                 raise
             raise LowerRateError(error, self.stop.run) from error
         except SIGTERMException:
+            if not is_first():
+                return 0
             if self.stop is None:
                 return 128 + signal.SIGTERM
             print(f"stopped at update {self.trainer.global_step}, resume with: forbes fit --resume {self.stop.run}")
             return self.stop.exit_status
+        if not is_first():
+            return 0
         if self.command == "predict":
             _print_predictions(found)
         elif self.command != "fit":

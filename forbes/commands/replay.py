@@ -74,17 +74,26 @@ def first_not_finite(module: WorldModel | KnownBelief, failure: Mapping[str, Any
         batch = SequenceBatch(**content).to(device)
         _stand_before(module, failure["update"], number)
         module.on_train_batch_start(batch, batch_idx=1)  # seeds the noise; index 0 would check the data of an epoch
-        with torch.autocast(device, torch.bfloat16, enabled=failure["precision"].startswith("bf16")):
-            loss, terms = module.total_loss(batch) if isinstance(module, WorldModel) else (module.loss(batch), {})
-        for name, values in terms.items():
-            watch.look(f"the loss term {name}", values)
-        watch.look("the loss", loss)
-        if watch.found:
-            break
-        loss.backward()
+        for rank, share in enumerate(_shares(batch, failure.get("processes", 1))):
+            if rank:
+                module.seed_update(rank)
+            with torch.autocast(device, torch.bfloat16, enabled=failure["precision"].startswith("bf16")):
+                loss, terms = module.total_loss(share) if isinstance(module, WorldModel) else (module.loss(share), {})
+            for name, values in terms.items():
+                watch.look(f"the loss term {name}", values)
+            watch.look("the loss", loss)
+            if watch.found:
+                return watch.found[0]
+            loss.backward()
     gradients = [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
     watch.look("the norm of all gradients", torch.nn.utils.get_total_norm(gradients))
     return next(iter(watch.found), None)
+
+
+def _shares(batch: SequenceBatch, processes: int) -> list[SequenceBatch]:
+    """Return the part of a batch that each process of the training had."""
+    size = len(batch.mask) // processes
+    return [batch.rows(slice(rank * size, (rank + 1) * size)) for rank in range(processes)]
 
 
 class _Watch:
@@ -146,6 +155,9 @@ def _problem_of(failure: Any) -> str:
             return "one of its batches lacks a field"
         if not all(isinstance(value, Tensor) for value in batch.values()):
             return "one of its batches has values that are not tensors"
+    processes = failure.get("processes", 1)  # files of older versions have none
+    if type(processes) is not int or processes < 1 or any(len(b["mask"]) % processes for b in failure["batches"]):
+        return f"its batches cannot be shared by {processes} processes"
     if len(failure["batch_numbers"]) != len(failure["batches"]):
         return "it does not have one number per batch"
     return ""

@@ -9,10 +9,12 @@ from lightning import LightningModule
 from lightning.pytorch.plugins import Precision
 
 from forbes.data import Experience, SequenceDataModule
+from forbes.data.datamodule import require_divisible
 from forbes.errors import ForbesError
+from forbes.runs.launched import launched_devices
 from forbes.training.world_model import WorldModel
 
-__all__ = ["require_usable"]
+__all__ = ["require_processes", "require_usable"]
 
 
 class _Rule(NamedTuple):
@@ -23,9 +25,16 @@ class _Rule(NamedTuple):
     expected: str
 
 
-def _one_device(devices: Any) -> bool:
-    """Return whether this is one device on every machine: the number 1, or one index as `3,` or `[3]`."""
-    return re.fullmatch(r"1|\d+,|\[\d+\]", str(devices)) is not None
+def _is_definite(devices: Any) -> bool:
+    """Return whether this is a number of devices, or a list of indices such as `3,` or `[0, 1]`."""
+    return re.fullmatch(r"[1-9]\d*|\d+,(\d+)?|\[\d+(, ?\d+)*\]", str(devices)) is not None
+
+
+def _num_processes(trainer: Namespace) -> int:
+    """Return the number of processes of a training: one for each device of each machine."""
+    devices = str(trainer["devices"])
+    here = int(devices) if devices.isdecimal() else len(re.findall(r"\d+", devices))
+    return here * int(trainer["num_nodes"])
 
 
 def _no_precision(plugins: Any) -> bool:
@@ -33,12 +42,20 @@ def _no_precision(plugins: Any) -> bool:
     return not any(isinstance(plugin, Precision) for plugin in listed)
 
 
-_DEVICE = "A training uses one device"
+_STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true", "ddp_find_unused_parameters_false")
 _WHOLE_EPOCHS = "An agent trains in whole epochs, each with an episode of its own. Set --trainer.max_epochs"
 _ALWAYS = (
-    _Rule("devices", _one_device, f"1, or the index of one as [0]. {_DEVICE}"),
-    _Rule("num_nodes", lambda nodes: nodes == 1, f"1. {_DEVICE}"),
-    _Rule("strategy", lambda strategy: strategy == "auto", f"auto. {_DEVICE}"),
+    _Rule("devices", _is_definite, "a number above 0, or indices as [0,1]. The noise depends on the number"),
+    _Rule(
+        "num_nodes",
+        lambda nodes: nodes == 1 or launched_devices() is not None,
+        "1. Start the processes on several machines with torchrun or SLURM",
+    ),
+    _Rule(
+        "strategy",
+        lambda strategy: strategy in _STRATEGIES,
+        "auto or ddp. Each device has the whole model and its share of every batch",
+    ),
     _Rule(
         "precision",
         lambda precision: str(precision) in ("None", "32", "32-true", "bf16", "bf16-mixed"),
@@ -52,6 +69,14 @@ _ALWAYS = (
         "false. Write less with --trainer.logger false --trainer.enable_checkpointing false",
     ),
     _Rule("model_registry", lambda name: name is None, "null. It is for the checkpoints of Lightning's own callback"),
+)
+_OF_SEVERAL_PROCESSES = tuple(
+    _Rule(
+        f"limit_{split}_batches",
+        lambda limit: limit is None or limit == 0 or (limit == 1 and isinstance(limit, float)),
+        "null or 0. Each process would take as many. Set --data.validation_sequences",
+    )
+    for split in ("val", "test")
 )
 _OF_A_WORLD_MODEL = (
     _Rule("gradient_clip_val", lambda norm: norm is None, "null. The model clips itself: --model.clip_norm NORM"),
@@ -78,9 +103,28 @@ def require_usable(trainer: Namespace, model: LightningModule, data: SequenceDat
         ForbesError: for the first refused argument.
     """
     rules = list(_ALWAYS)
+    rules += _OF_SEVERAL_PROCESSES if _num_processes(trainer) > 1 else ()
     rules += _OF_A_WORLD_MODEL if isinstance(model, WorldModel) else ()
     rules += _OF_AN_AGENT if isinstance(data.source, Experience) else ()
     for rule in rules:
         if not rule.accepts(value := trainer[rule.argument]):
             found = type(value).__name__ if rule.argument == "plugins" else value
             raise ForbesError(f"trainer.{rule.argument}: is {found}, expected {rule.expected}")
+    require_divisible(data.batch_size, _num_processes(trainer))
+
+
+def require_processes(trainer: Namespace, command: str, on_divergence: str) -> None:
+    """Refuse what several processes cannot do.
+
+    Args:
+        trainer: section `trainer` of the configuration.
+        command: fit, validate, test or predict.
+        on_divergence: what `fit` does after a divergence.
+
+    Raises:
+        ForbesError: if it is for one process, and there are several.
+    """
+    if _num_processes(trainer) > 1 and command == "predict":
+        raise ForbesError("forbes predict: prints in order, expected one process. Set --trainer.devices 1")
+    if _num_processes(trainer) > 1 and on_divergence != "stop":
+        raise ForbesError(f"--on-divergence {on_divergence}: expected one process. Set --trainer.devices 1")

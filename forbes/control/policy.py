@@ -155,7 +155,8 @@ class ScalarHead(nn.Module):
             features: f, `(*, F)`.
             target: x, `(*)`.
         """
-        return 0.5 * (self(features) - target).square()
+        difference: Tensor = self(features) - target  # (*)
+        return 0.5 * difference.square()
 
 
 class TwoHotHead(ScalarHead):

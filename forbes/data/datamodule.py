@@ -12,7 +12,7 @@ from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch
 from forbes.distributed import num_ranks, rank
 from forbes.errors import ForbesError, require_at_least
 
-__all__ = ["SequenceDataModule", "datamodule_of"]
+__all__ = ["SequenceDataModule", "datamodule_of", "require_divisible"]
 
 
 class _Batches(IterableDataset[Any]):
@@ -44,17 +44,22 @@ class _TrainIndices:
         return self.datamodule.updates_per_epoch
 
 
+def require_divisible(batch_size: int, processes: int) -> None:
+    """Raise a ForbesError if the processes of a training cannot share a batch equally."""
+    if batch_size % processes:
+        raise ForbesError(
+            f"SequenceDataModule: batch_size is {batch_size}, expected a multiple of {processes}, the number of "
+            "processes that share each batch. Choose another"
+        )
+
+
 def _share(index: Tensor) -> Tensor:
     """Return the part of a training batch, `(B,)`, that belongs to this rank, `(B / R,)`.
 
     Raises:
         ForbesError: if the ranks do not divide the batch.
     """
-    if len(index) % num_ranks():
-        raise ForbesError(
-            f"SequenceDataModule: batch_size is {len(index)}, expected a multiple of {num_ranks()}, the number of "
-            "processes that share each batch. Choose another"
-        )
+    require_divisible(len(index), num_ranks())
     return index.reshape(num_ranks(), -1)[rank()]  # (B / R,)
 
 

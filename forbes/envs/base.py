@@ -69,6 +69,13 @@ class Environment(ABC):
     def step(self, action: NDArray[np.float32]) -> Step:
         """Apply an action, float32 `(A,)`."""
 
+    def named_parts(self) -> dict[str, list[int]]:
+        """Return the indices of the dimensions of a vector observation by name, for the view `hide`.
+
+        Parts may overlap: `velocities` are those dimensions that depend on velocities.
+        """
+        return {}
+
     def describe(self) -> dict[str, Any]:
         """Return all settings that determine the episodes, as plain values, for the record.
 

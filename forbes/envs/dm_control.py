@@ -14,14 +14,26 @@ from numpy.typing import NDArray
 
 from forbes.envs.base import Environment, Step, repeat, require_repeat, scale_action
 from forbes.envs.rendering import choose_backend
+from forbes.envs.views import VELOCITIES
 from forbes.errors import ForbesError
 
-__all__ = ["DeepMindControl", "measure"]
+__all__ = ["DeepMindControl", "environment_variable", "measure"]
 
 _NO_RENDERING = "disable"
 """Value of MUJOCO_GL for which dm_control loads no backend."""
 _NO_BOUND = 1e10
 """MuJoCo's largest number, which the suite uses for an actuator without bounds."""
+_MOVING = (
+    *("velocity", "arm_vel", "object_vel", "box_vel", "com_velocity", "torso_velocity", "torso_com_velocity"),
+    *("body_velocities", "joint_velocites", "touch", "touch_sensors", "foot_forces", "force_torque", "imu"),
+    "inertial_sensors",
+)
+_VELOCITY = {
+    **dict.fromkeys(_MOVING, slice(None)),
+    "egocentric_state": slice(16, 32),  # the quadruped's qpos, qvel and actuators
+    "ball_state": slice(3, None),  # the position and the velocity of the dog's ball
+}
+"""The suite's measurements that depend on velocities, and which of their numbers: contact forces do, too."""
 _FRAMES = 10  # number of frames to measure the speed
 
 
@@ -118,6 +130,17 @@ class DeepMindControl(Environment):
             raise RuntimeError(f"{self.backend} renders a frame of one colour")
         return np.ascontiguousarray(frame.transpose(2, 0, 1))  # (3, H, W)
 
+    def named_parts(self) -> dict[str, list[int]]:
+        """Return the suite's measurements by name, and `velocities`: all numbers that depend on velocities."""
+        if self.pixels:
+            return {}
+        parts: dict[str, list[int]] = {}
+        for name, spec in self._environment.observation_spec().items():
+            first = sum(map(len, parts.values()))
+            parts[name] = list(range(first, first + int(np.prod(spec.shape))))
+        velocities = [index for name, part in parts.items() if name in _VELOCITY for index in part[_VELOCITY[name]]]
+        return parts | {VELOCITIES: velocities}
+
     def describe(self) -> dict[str, Any]:
         """Return task, rendering options and versions."""
         made_by = {name: version(name) for name in ("dm-control", "mujoco")}
@@ -141,7 +164,7 @@ def _load(task: str, backend: str) -> Any:
     Raises:
         ForbesError: if it was imported for another backend, or there is no such task.
     """
-    with _environment_variable("MUJOCO_GL", backend):  # read at the first import
+    with environment_variable("MUJOCO_GL", backend):  # read at the first import
         from dm_control import _render, suite
     if backend not in (_NO_RENDERING, _render.BACKEND):
         raise ForbesError(
@@ -157,7 +180,7 @@ def _load(task: str, backend: str) -> Any:
 
 
 @contextmanager
-def _environment_variable(name: str, value: str) -> Iterator[None]:
+def environment_variable(name: str, value: str) -> Iterator[None]:
     """Set an environment variable inside the `with` block."""
     before = os.environ.get(name)
     os.environ[name] = value

@@ -9,9 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.envs.base import Environment, Step, repeat, require_repeat
+from forbes.envs.images import to_image
+from forbes.envs.views import VELOCITIES
 from forbes.errors import ForbesError
 
 __all__ = ["Gymnasium"]
+
+_VELOCITY = {"CartPole": [1, 3], "Pendulum": [2], "Acrobot": [4, 5], "MountainCar": [1], "MountainCarContinuous": [1]}
+"""Indices of the velocities in the environments whose vectors have no names, by the environment's name."""
+_MOVING = ("qvel", "cvel", "ten_velocity", "cfrc_ext")
+"""Those of the parts of MuJoCo's environments that depend on velocities: contact forces do, too."""
 
 
 class Gymnasium(Environment):
@@ -88,12 +95,27 @@ class Gymnasium(Environment):
 
     def _observe(self, observation: Any) -> NDArray[Any]:
         if self.pixels:
-            return self._spaces.to_image(self._environment.render(), self.size)
+            return to_image(self._environment.render(), self.size)
         if self.part is not None:
             observation = observation[self.part]
         if self._spaces.is_image(self._seen):
-            return self._spaces.to_image(observation, self.size)
+            return to_image(observation, self.size)
         return self._spaces.flatten(self._seen, observation)
+
+    def named_parts(self) -> dict[str, list[int]]:
+        """Return the entries of a Dict or the parts of a MuJoCo environment by name, and `velocities` where known."""
+        if len(self.observation_shape) != 1:
+            return {}
+        sizes = self._spaces.sizes(self._seen)
+        structure: dict[str, int] = getattr(self._environment.unwrapped, "observation_structure", {})
+        sizes |= {name: size for name, size in structure.items() if name != "skipped_qpos"}
+        parts: dict[str, list[int]] = {}
+        for name, size in sizes.items():
+            first = sum(map(len, parts.values()))
+            parts[name] = list(range(first, first + size))
+        velocities = [index for name in _MOVING for index in parts.get(name, [])]
+        velocities += _VELOCITY.get(self._environment.spec.id.rpartition("-")[0], [])
+        return {name: part for name, part in (parts | {VELOCITIES: velocities}).items() if part}
 
     def describe(self) -> dict[str, Any]:
         """Return task, kind of observation and version."""

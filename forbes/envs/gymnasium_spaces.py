@@ -7,12 +7,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from forbes.envs.base import finite_bounds, scale_action
+from forbes.envs.images import CHANNELS
 from forbes.errors import ForbesError
 
-__all__ = ["flatten", "is_image", "require_actions", "require_observations", "to_action", "to_image"]
+__all__ = ["flatten", "is_image", "require_actions", "require_observations", "sizes", "to_action"]
 
 _FLAT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-_CHANNELS = (1, 3, 4)
 _REGISTER = "Wrap and register it in a module of your own, and use: gymnasium:MODULE:ID"
 
 
@@ -20,26 +20,8 @@ def is_image(space: Any) -> bool:
     """Return whether a space is a uint8 Box of 0 to 255, `(H, W)` or with 1, 3 or 4 channels, first or last."""
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
         return False
-    channels = len(space.shape) == 2 or space.shape[0] in _CHANNELS or space.shape[-1] in _CHANNELS
+    channels = len(space.shape) == 2 or space.shape[0] in CHANNELS or space.shape[-1] in CHANNELS
     return channels and bool((space.low == 0).all() and (space.high == 255).all())
-
-
-def to_image(pixels: Any, size: int | None = None) -> NDArray[np.uint8]:
-    """Return pixels `(H, W)`, `(H, W, C)` or `(C, H, W)` as uint8 `(C, H, W)`.
-
-    Args:
-        pixels: image, uint8.
-        size: side of the result in pixels, resized by averaging; None keeps the original size.
-    """
-    image = np.atleast_3d(pixels)  # (H, W, C) or (C, H, W)
-    if image.shape[-1] in _CHANNELS:
-        image = image.transpose(2, 0, 1)  # (C, H, W)
-    if size is not None and image.shape[1:] != (size, size):
-        from PIL import Image
-
-        small = (Image.fromarray(channel).resize((size, size), Image.Resampling.BOX) for channel in image)
-        image = np.stack([np.asarray(channel) for channel in small])  # (C, size, size)
-    return np.ascontiguousarray(image)
 
 
 def flatten(space: Any, value: Any) -> NDArray[np.float32]:
@@ -60,6 +42,15 @@ def flatten(space: Any, value: Any) -> NDArray[np.float32]:
         bounded = np.isfinite(high - low)
         flat = np.where(bounded, (flat - low) / np.where(bounded & (high > low), high - low, 1), flat)
     return flat.astype(np.float32)
+
+
+def sizes(space: Any) -> dict[str, int]:
+    """Return how many numbers `flatten` makes of each entry of a Dict; of another space, nothing."""
+    entries = space.spaces if isinstance(space, spaces.Dict) else {}
+    return {
+        str(name): sum(0 if _is_text(leaf) else spaces.flatdim(leaf) for leaf in _parts(entry))
+        for name, entry in entries.items()
+    }
 
 
 def require_observations(task: str, space: Any) -> None:

@@ -6,11 +6,14 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from forbes.envs.base import Environment
 from forbes.envs.dm_control import DeepMindControl
 from forbes.envs.gymnasium import Gymnasium
+from forbes.envs.memory_maze import SIZES, MemoryMaze
+from forbes.envs.views import VIEWS, look_through
 from forbes.errors import ForbesError
 
 if TYPE_CHECKING:
@@ -19,13 +22,17 @@ if TYPE_CHECKING:
 __all__ = ["TASKS", "find_environment"]
 
 _GYMNASIUM = "gymnasium:"
+_PACKAGES = ("minigrid", "popgym")
+"""Packages of environments that are extras of this one, and may therefore be imported by name."""
 _HORIZONS = {"mountain_hike": 75, "multi_start_hike": 75, "t_maze": 30, "tiger": 30}
 """Steps per episode as in DVRL, in DPFRL, 3 L as in belief-rnn; that of the tiger is our choice."""
 
 TASKS = f"""\
 {", ".join(_HORIZONS)}: processes with an exact belief
+memory_maze_SIZE: SIZE is {", ".join(SIZES)}; needs the extra memory-maze
 {_GYMNASIUM}ID: any environment of Gymnasium; for a package that registers its own, with the package's name:
-  {_GYMNASIUM}minigrid:MiniGrid-Empty-5x5-v0; for a module of your own, also with --allow-module MODULE
+  {_GYMNASIUM}minigrid:MiniGrid-MemoryS7-v0, {_GYMNASIUM}popgym:popgym-RepeatPreviousEasy-v0;
+  for a module of your own, also with --allow-module MODULE
 CLASS: an Environment of your own, in a module named by --allow-module
 other: a task of the DeepMind Control Suite as domain_task: cartpole_swingup, ball_in_cup_catch, walker_walk"""
 
@@ -46,6 +53,7 @@ def _open_process(task: str, shows: "Shown" = "observation") -> Environment:
 
 _NAMED: dict[str, Callable[..., Environment]] = {
     **{name: partial(_open_process, name) for name in _HORIZONS},
+    **{f"memory_maze_{size}": partial(MemoryMaze, size) for size in SIZES},
 }
 """Environments of this package by name."""
 
@@ -55,7 +63,8 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
 
     Args:
         task: name of the task, one of those in `TASKS`.
-        options: arguments of the environment's constructor.
+        options: arguments of the environment's constructor, and views (`VIEWS`), applied in this order; a view whose
+            value is None is left out, and an argument of the constructor is no view.
 
     Raises:
         ForbesError: if there is no such task or option, or the task would import a module that is not allowed.
@@ -83,21 +92,26 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
         )
     else:
         make = partial(DeepMindControl, task)
-    unknown = options.keys() - inspect.signature(make).parameters.keys()
-    if unknown:
+    known = inspect.signature(make).parameters.keys()
+    views = {name: value for name, value in options.items() if name in VIEWS and name not in known}
+    own = {name: value for name, value in options.items() if name not in views}
+    if unknown := own.keys() - known:
         raise ForbesError(f"{task}: its environment has no option {min(unknown)}. Remove it")
-    return partial(make, **options)
+    make, views = partial(make, **own), {name: value for name, value in views.items() if value is not None}
+    return partial(look_through, make, views) if views else make
 
 
 def _require_known_module(task: str) -> None:
     """Refuse `gymnasium:MODULE:ID` if Gymnasium would import an unknown module.
 
     A configuration may come from an untrusted source, and importing a module runs it. Known modules are those imported
-    already, e.g. by --allow-module, and packages that register environments by an entry point.
+    already, e.g. by --allow-module, packages that register environments by an entry point, and our extras.
     """
     module = task.removeprefix(_GYMNASIUM).rpartition(":")[0]
+    if module in _PACKAGES and find_spec(module) is None:
+        raise ForbesError(f"{task}: {module} is not installed. pip install 'forbes[{module}]'")
     registering = {entry.module.partition(".")[0] for entry in entry_points(group="gymnasium.envs")}
-    if module and module not in {*sys.modules, *registering}:
+    if module and module not in {*sys.modules, *registering, *_PACKAGES}:
         raise ForbesError(
             f"{task}: {module} is not a package that registers environments. If you trust it, add: "
             f"--allow-module {module}"

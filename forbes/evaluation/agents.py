@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from forbes.data import Experience
-from forbes.data.episodes.collection import describe_environment
+from forbes.data.episodes.collection import describe_environment, episode_seed
 from forbes.data.episodes.episode import Episode
 from forbes.envs import Environment, EnvironmentProcess
 from forbes.envs.known_process import KnownProcess
@@ -26,11 +26,13 @@ from forbes.seeding import derive_seed
 from forbes.training.acting import WorldModelAgent, play_measured
 from forbes.training.loading import load_run, loaded_agent
 
-__all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", "play_test_episode", "summarise_agents"]
+__all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", "play_test_episode"]
+__all__ += ["seed_of_test_episode", "summarise_agents"]
 
 DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
 REWARD = "reward_uncertainty"
-_APART = ("made_by", "shows", "observation_shape")
+_TEST = "test episode"
+_APART = ("made_by", "shows", "views", "observation_shape")
 """Fields in which environments of one task may differ: the rewards do not depend on what the agent is shown."""
 
 
@@ -182,7 +184,12 @@ def _record(one: PlayedAgent, folder: Path, seed: int, command: str) -> None:
 
 def play_test_episode(agent: WorldModelAgent, environment: Environment, seed: int, number: int) -> Episode:
     """Play a test episode, which was not used in training. The same seed gives every agent the same episode."""
-    return play_measured(agent, environment, "test episode", seed, number)
+    return play_measured(agent, environment, _TEST, seed, number)
+
+
+def seed_of_test_episode(seed: int, number: int) -> int:
+    """Return the seed with which `play_test_episode` resets the environment."""
+    return episode_seed(seed, number, _TEST)
 
 
 def _counted(run: str, episodes: int) -> Iterator[int]:

@@ -5,21 +5,15 @@ No model is loaded, so runs can be drawn while they train, or where their checkp
 
 import re
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
 
 from forbes.errors import ForbesError
 from forbes.runs.folder import RunFolder, read_config, read_metrics
+from forbes.runs.naming import class_of, method_of, part_of, task_of, with_suffix, without_seed
 
-__all__ = ["LAYERS", "TRAJECTORIES", "RecordedRun", "group_by_method", "read_run", "returns_of", "with_suffix"]
-__all__ += ["without_seed"]
-
-_GAUSSIAN = {"WorldModel": "RSSM", "ImaginationActorCritic": "Dreamer", "PlanningAgent": "PlaNet"}
-"""Published names of what learns a Gaussian belief, by its class."""
-_SHOWN = {"exact_belief": "exact belief", "nothing": "no observation"}
-"""Names of agents that observe something else than the observation."""
+__all__ = ["LAYERS", "TRAJECTORIES", "RecordedRun", "group_by_method", "read_run", "returns_of"]
 
 TRAJECTORIES, LAYERS = "trajectories", "mlp_layers"
 _SETTINGS = {TRAJECTORIES: "N = {}", LAYERS: "{} layers"}
@@ -43,7 +37,7 @@ class RecordedRun(NamedTuple):
     @property
     def source(self) -> str:
         """Class of the source of its data."""
-        return _class(_part(self.config, "data", "init_args", "source"))
+        return class_of(part_of(self.config, "data", "init_args", "source"))
 
 
 def read_run(path: str) -> RecordedRun:
@@ -59,61 +53,8 @@ def read_run(path: str) -> RecordedRun:
     config = {name: without_seed(found[name]) for name in ("model", "data")}
     arguments = config["model"]["init_args"]
     settings = {name: arguments[name] for name in _SETTINGS if name in arguments}
-    method = with_suffix(_method(config), path)
-    return RecordedRun(path, method, _task(config["data"]["init_args"]), settings, config)
-
-
-def with_suffix(method: str, path: str) -> str:
-    """Append the suffix of the experiment's name in a run's path: RSSM wide for `runs/rssm_wide-0`."""
-    for part in reversed(Path(path).resolve().parts):
-        if match := re.search(rf"(?<![a-z]){method}((?:_[a-z]+)+)(?![a-z\d])", part, re.IGNORECASE):
-            return method + match[1].replace("_", " ")
-    return method
-
-
-def without_seed(section: dict[str, Any]) -> dict[str, Any]:
-    """Return a section of a configuration without its seed."""
-    arguments = {name: value for name, value in section.get("init_args", {}).items() if name != "seed"}
-    return section | {"init_args": arguments}
-
-
-def _method(config: dict[str, Any]) -> str:
-    """Return the published name of an agent or world model."""
-    arguments = config["model"]["init_args"]
-    shown = _part(_part(config["data"]["init_args"], "source", "init_args"), "options").get("shows")
-    if shown in _SHOWN:
-        return _SHOWN[shown]
-    kind = _class(_part(arguments, "model"))
-    if kind not in ("", "StateSpaceModel"):
-        return kind.removesuffix("Model")
-    posterior, prior = (_class(_part(arguments, name)) for name in ("belief", "prior"))
-    belief = prior if prior and posterior == "GaussianBelief" else posterior  # FORBES may have a flow in one only
-    if belief == "GaussianBelief":
-        return _GAUSSIAN.get(learner := _class(config["model"]), learner)
-    return "FORBES" if belief == "FlowBelief" else belief.removesuffix("Belief")
-
-
-def _task(arguments: dict[str, Any]) -> str:
-    """Return the task of an agent, or the name of a world model's data."""
-    source = _part(arguments, "source")
-    options = _part(source, "init_args")
-    if "task" in options:
-        return str(options["task"])
-    path = options.get("path")
-    return Path(path).name.removesuffix(".npz") if path else _class(source)
-
-
-def _part(section: dict[str, Any], *names: str) -> dict[str, Any]:
-    """Return a nested section, empty if it is not there."""
-    for name in names:
-        found = section.get(name)
-        section = found if isinstance(found, dict) else {}
-    return section
-
-
-def _class(section: dict[str, Any]) -> str:
-    """Return the name of a class in a configuration, without its module."""
-    return str(section.get("class_path", "")).rpartition(".")[2]
+    method = with_suffix(method_of(config), path)
+    return RecordedRun(path, method, task_of(config["data"]["init_args"]), settings, config)
 
 
 def group_by_method(

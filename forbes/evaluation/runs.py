@@ -12,8 +12,8 @@ from torch import nn
 from forbes.beliefs import FlowBelief, GaussianBelief
 from forbes.data import SequenceBatch, SequenceDataModule, Split
 from forbes.errors import ForbesError
-from forbes.evaluation.methods import with_suffix, without_seed
 from forbes.models import BeliefModel, StateSpaceModel
+from forbes.runs.naming import with_suffix, without_seed
 from forbes.training.loading import open_run
 
 __all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "method_name", "model_name"]
@@ -50,8 +50,11 @@ class TrainedRun(NamedTuple):
 
 
 def method_name(kind: type[nn.Module]) -> str:
-    """Return the published name of a belief family or a model, or that of its class: Mixture for a `MixtureBelief`."""
-    return _PUBLISHED.get(kind, kind.__name__.removesuffix("Belief").removesuffix("Model"))
+    """Return the published name of a belief family or a model, or that of its class: Mixture for a `MixtureBelief`.
+
+    An adapter that is only called Model has the name of its module.
+    """
+    return _PUBLISHED.get(kind, kind.__name__.removesuffix("Belief").removesuffix("Model") or kind.__module__)
 
 
 def model_name(model: BeliefModel) -> str:

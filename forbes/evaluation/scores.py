@@ -18,7 +18,7 @@ is not scored; log-probabilities are summed in float64. With
 - PLL, the prequential log-likelihood, scores the filtering belief. Its particles are drawn from the belief after t - 1
   observations (h_t follows from it), and o_t is used only to score them. So it is a proper score of the belief, and its
   K-sample estimate is a lower bound of it (Jensen). The posterior helps to estimate the integral over s_t, without bias
-  (`StateSpaceModel.one_step_log_prob`). The weights of weighted particles enter the mean; a model without randomness
+  (`PosteriorModel.one_step_log_prob`). The weights of weighted particles enter the mean; a model without randomness
   has K = 1.
 - FIVO (Maddison et al., 2017, arXiv 1705.09279) resamples, with the particles of `forbes.models.particles` and
   systematic resampling, regardless of the training objective.
@@ -35,7 +35,7 @@ import torch
 from torch import Tensor
 
 from forbes.data import SequenceBatch
-from forbes.models import BeliefModel, StateSpaceModel
+from forbes.models import BeliefModel, PosteriorModel, has_posterior
 from forbes.models.particles import effective_sample_size, run_particles, systematic
 
 __all__ = ["Increments", "LogMeanExp", "Trajectory", "frame_log_prob", "score_open_loop", "score_particles"]
@@ -56,7 +56,7 @@ class Trajectory(NamedTuple):
     kl: Tensor
     """log q(s_t) - log p(s_t), `(B, T)`."""
     prediction: Tensor | None
-    """An estimate of log p(o_t | h_t) (`StateSpaceModel.one_step_log_prob`), `(B, T)`; None unless it was requested."""
+    """An estimate of log p(o_t | h_t) (`PosteriorModel.one_step_log_prob`), `(B, T)`; None unless it was requested."""
 
 
 class LogMeanExp:
@@ -95,7 +95,7 @@ def frame_log_prob(model: BeliefModel, features: Tensor, target: Tensor) -> Tens
     return torch.cat(parts, -1)  # (*, N)
 
 
-def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, predict: bool) -> Iterator[Trajectory]:
+def trajectories(model: PosteriorModel, batch: SequenceBatch, number: int, predict: bool) -> Iterator[Trajectory]:
     """Sample trajectories one at a time, so that only one is in memory. The encoder runs once.
 
     Args:
@@ -120,7 +120,7 @@ def trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, pred
 
 
 @torch.no_grad()
-def score_trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int, predict: bool) -> Increments:
+def score_trajectories(model: PosteriorModel, batch: SequenceBatch, number: int, predict: bool) -> Increments:
     """Score a batch with K trajectories: `elbo`, `reconstruction`, `kl`, `iwae`, and `pll` if `predict` is set.
 
     `iwae` at step t is the bound of the first t steps minus that of the first t - 1, so it sums to the whole bound.
@@ -148,19 +148,19 @@ def score_trajectories(model: StateSpaceModel, batch: SequenceBatch, number: int
 @torch.no_grad()
 def score_predictions(model: BeliefModel, batch: SequenceBatch, number: int) -> Increments:
     """Score a batch with K particles: `pll`, and `iwae` if the model has a posterior."""
-    if isinstance(model, StateSpaceModel) and model.particles == 1:
+    if has_posterior(model) and model.particles == 1:
         return score_trajectories(model, batch, number, predict=True)  # the same trajectories give both scores
     encoded, prediction = model.encode(batch.observation, batch.action), LogMeanExp()
     for _ in range(model.num_belief_samples(number)):
         prediction.add(model.predictive_log_prob(encoded, partial(frame_log_prob, model)))
     scores = {"pll": prediction.result() * batch.mask}
-    if isinstance(model, StateSpaceModel):
+    if has_posterior(model):
         scores |= score_trajectories(model, batch, number, predict=False)
     return scores
 
 
 @torch.no_grad()
-def score_particles(model: StateSpaceModel, batch: SequenceBatch, number: int) -> Increments:
+def score_particles(model: PosteriorModel, batch: SequenceBatch, number: int) -> Increments:
     """Score a batch with K particles: `fivo`, and `ess`, the effective sample size before resampling divided by K.
 
     Args:

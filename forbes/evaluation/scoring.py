@@ -24,7 +24,7 @@ from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import split_batches
 from forbes.evaluation.scores import Increments, score_open_loop, score_particles, score_predictions, score_trajectories
 from forbes.files import replace_file
-from forbes.models import BeliefModel, StateSpaceModel
+from forbes.models import BeliefModel
 from forbes.pomdps import Process
 from forbes.reading import read_npz
 from forbes.seeding import derive_seed, forked
@@ -57,9 +57,8 @@ class Scorer(NamedTuple):
     """Number of leading steps that the model observes and that are not scored."""
 
     def of(self, model: BeliefModel) -> "Scorer":
-        """Drop the bounds for a model without a posterior: its likelihood is exact, and is reported as `pll`."""
-        bounds = () if isinstance(model, StateSpaceModel) else _BOUNDS
-        return self._replace(metrics=tuple(metric for metric in self.metrics if metric not in bounds))
+        """Drop what a model lacks, e.g. the bounds if it has no posterior with a density."""
+        return self._replace(metrics=tuple(metric for metric in self.metrics if metric not in model.lacks))
 
 
 class Scores(NamedTuple):
@@ -81,7 +80,6 @@ class Scores(NamedTuple):
         return total / self.steps if metric == "ess" else total
 
 
-_BOUNDS = ("elbo", "reconstruction", "kl", "iwae", "fivo", "ess")
 _FIVO_ROWS = 16
 """FIVO holds all particles of a sequence at once. It gets this many rows per sequence of another scorer's batch."""
 
@@ -159,6 +157,8 @@ def evaluate(
     found: dict[str, Estimate] = {}
     for name in scores:
         score = make_scorer(name, numbers[PASSES[name]], batch_size, context).of(model)
+        if not score.metrics:  # the model has none of them
+            continue
         scored = score_split(model, split_batches(data, split, count, score.batch_size), score, seed)
         found |= {metric: Estimate.of(scored.total(metric)) for metric in score.metrics}
     return found

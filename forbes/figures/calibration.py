@@ -36,8 +36,8 @@ class RankedBelief(NamedTuple):
     style: Method
     value_ranks: Tensor
     """Ranks of the values, `(N, D)`, drawn as one line per dimension."""
-    density_ranks: Tensor
-    """Ranks of their log-densities, `(N,)`."""
+    density_ranks: Tensor | None
+    """Ranks of their log-densities, `(N,)`; None for a belief without a density, whose coverage is not drawn."""
 
 
 def draw_calibration(runs: Sequence[str]) -> dict[str, Figure]:
@@ -70,12 +70,13 @@ def calibration(beliefs: Sequence[RankedBelief], samples: int) -> Figure:
         beliefs: beliefs with the same number of ranks.
         samples: number of samples that were ranked, L.
     """
-    count = len(beliefs[0].density_ranks)
+    count = len(beliefs[0].value_ranks)
     for belief in beliefs:
-        if len(belief.density_ranks) != count or len(belief.value_ranks) != count:
+        found = [len(ranks) for ranks in (belief.value_ranks, belief.density_ranks) if ranks is not None]
+        if found != [count] * len(found):
             raise ForbesError(
-                f"{belief.name}: {len(belief.value_ranks)} and {len(belief.density_ranks)} ranks, expected {count} as "
-                f"for {beliefs[0].name}. Rank the same states under each belief"
+                f"{belief.name}: {' and '.join(map(str, found))} ranks, expected {count} as for {beliefs[0].name}. "
+                "Rank the same states under each belief"
             )
     with paper_style():
         figure = Figure((PAGE, 2.3), layout="constrained")
@@ -128,8 +129,9 @@ def _draw_coverage(axes: Axes, beliefs: Sequence[RankedBelief], count: int, samp
     axes.fill_between(levels, low, high, color=GREY, alpha=0.3, lw=0)
     axes.plot([0, 1], [0, 1], color=BLACK, lw=0.6)
     for belief in beliefs:
-        inside = coverage(belief.density_ranks, samples, levels)
-        axes.plot(levels, inside, color=belief.style.colour, ls=belief.style.line)
+        if belief.density_ranks is not None:
+            inside = coverage(belief.density_ranks, samples, levels)
+            axes.plot(levels, inside, color=belief.style.colour, ls=belief.style.line)
     axes.set(xlabel="nominal level of the region", ylabel="true values inside", xlim=(0, 1), ylim=(0, 1))
     axes.set_aspect("equal")
 

@@ -31,11 +31,19 @@ class CatalogueEntry(NamedTuple):
 
 _Entry = CatalogueEntry
 _CHOSEN = ("index", "samples", "mean", "context")
+_FOREIGN = ("model", "data")
 FIGURES = (
     _Entry(
         "beliefs", "1", "beliefs over time, next to the exact", "known processes", "beliefs:draw_beliefs", ("index",)
     ),
-    _Entry("predictions", "4", "completions next to the truth", "images", "predictions:draw_predictions", _CHOSEN),
+    _Entry(
+        "predictions",
+        "4",
+        "completions next to the truth",
+        "images",
+        "predictions:draw_predictions",
+        (*_CHOSEN, *_FOREIGN),
+    ),
     _Entry("elbo", "5", "validation ELBO against updates", "world models", "elbo:draw_elbo"),
     _Entry("per-step", "ours", "ELBO and its parts at each step", "world models, evaluated", "scores:draw_per_step"),
     _Entry("prequential", "ours", "log p(o_t | past)", "world models, evaluated", "scores:draw_prequential"),

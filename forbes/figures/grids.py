@@ -15,7 +15,17 @@ from forbes.figures.episodes import MAX_CHANNELS, to_rgb
 from forbes.figures.style import BLACK, GREY, PAGE, paper_style
 from forbes.rounding import ceil_div
 
-__all__ = ["Bars", "Panel", "draw_bands", "draw_panels", "require_images", "seen_panel", "seen_steps", "truth_panel"]
+__all__ = [
+    "Bars",
+    "Panel",
+    "draw_bands",
+    "draw_panels",
+    "is_image",
+    "require_images",
+    "seen_panel",
+    "seen_steps",
+    "truth_panel",
+]
 
 _GAP = 2  # pixels between the frames of a panel
 _GAP_COLOUR = 0.86
@@ -66,9 +76,14 @@ def seen_steps(context: int) -> list[int]:
     return sorted({ceil_div(context * part, 3) for part in (1, 2, 3)})
 
 
+def is_image(shape: Sequence[int]) -> bool:
+    """Return whether observations of this shape are images that `to_rgb` can convert."""
+    return len(shape) == 3 and 1 <= shape[0] <= MAX_CHANNELS
+
+
 def require_images(where: str, shape: Sequence[int], remedy: str) -> None:
     """Raise a ForbesError, with this remedy, unless observations of this shape are images that `to_rgb` can convert."""
-    if len(shape) != 3 or not 1 <= shape[0] <= MAX_CHANNELS:
+    if not is_image(shape):
         found = f"vectors of {shape[0]}" if len(shape) == 1 else f"of shape {tuple(shape)}"
         raise ForbesError(
             f"{where}: the observations are {found}, expected images of 1 to {MAX_CHANNELS} channels. {remedy}"

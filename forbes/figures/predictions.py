@@ -8,9 +8,9 @@ from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Strokes
 from forbes.errors import ForbesError
+from forbes.evaluation.adapters import load_all
 from forbes.evaluation.digits.neighbours import TrainingPrefixes, last_frame
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
-from forbes.evaluation.runs import load_runs
 from forbes.figures.families import RunFamily, group, require_same_data
 from forbes.figures.grids import Panel, draw_panels, require_images, seen_panel, truth_panel
 from forbes.seeding import forked
@@ -22,7 +22,13 @@ _SHOWN = 10
 
 
 def draw_predictions(
-    runs: Sequence[str], index: Sequence[int] = (), samples: int = 6, mean: bool = False, context: int = 15
+    runs: Sequence[str],
+    index: Sequence[int] = (),
+    samples: int = 6,
+    mean: bool = False,
+    context: int = 15,
+    model: Sequence[Sequence[str]] = (),
+    data: str | None = None,
 ) -> dict[str, Figure]:
     """Draw `predictions` at the last step of the data's length, and for digit strokes at the end of the longest shown.
 
@@ -33,12 +39,14 @@ def draw_predictions(
         samples: number of completions of each sequence, N.
         mean: for written strokes, draw pixel probabilities instead of samples.
         context: number of frames that the models see.
+        model: models trained elsewhere, as in `load_all`.
+        data: their data.
 
     Raises:
         ForbesError: if the observations are no images, the runs are of different data, or an argument does not fit
             the data.
     """
-    trained = load_runs(runs)
+    trained = load_all(runs, model, data, needs=("sample", "mean"))
     for run in trained:
         require_images(run.path, run.data.observation_shape, "Name runs of images, e.g. of strokes")
         if not run.data.source.size("test"):
@@ -46,16 +54,16 @@ def draw_predictions(
         if mean and not run.data.source.increments:
             raise ForbesError(f"--mean: the frames of {run.path} are expectations anyway, not sampled. Leave it out")
     require_same_data(trained)
-    data = trained[0].data
-    if not context < data.length:
-        raise ForbesError(f"--context {context}: expected less than the length of the sequences, {data.length}")
-    chosen = _chosen(data, index, context)
-    whole = isinstance(data.source, Strokes)
-    batch = whole_sequences(data, "test", chosen) if whole else data.sequences("test", chosen)
+    shown = trained[0].data
+    if not context < shown.length:
+        raise ForbesError(f"--context {context}: expected less than the length of the sequences, {shown.length}")
+    chosen = _chosen(shown, index, context)
+    whole = isinstance(shown.source, Strokes)
+    batch = whole_sequences(shown, "test", chosen) if whole else shown.sequences("test", chosen)
     families = group(trained)
     return {
-        f"predictions-t{time}": predictions(families, data.source, batch, time, context, samples, mean)
-        for time in sorted({data.length, batch.observation.shape[1]})
+        f"predictions-t{time}": predictions(families, shown.source, batch, time, context, samples, mean)
+        for time in sorted({shown.length, batch.observation.shape[1]})
     }
 
 

@@ -1,12 +1,14 @@
 """State-space models as pure modules: they compute and return records, and never log."""
 
-from forbes.models.base import BeliefModel, EncodedSequence, ModelFamily, ModelParts, Rollout, State
+from forbes.models.adapter import ModelAdapter
+from forbes.models.base import BeliefModel, EncodedSequence, ModelFamily, ModelParts, RecurrentModel, Rollout, State
 from forbes.models.elbo import ElboTerms, elbo_loss
 from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, OnePixel, SymlogNormal, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
 from forbes.models.particles import ParticleModel
 from forbes.models.pixels import PixelDecoder, PixelEncoder
-from forbes.models.state_space import Filtered, StateSpaceModel
+from forbes.models.posterior import Filtered, PosteriorModel, has_posterior
+from forbes.models.state_space import StateSpaceModel
 from forbes.models.vector import VectorModel
 
 __all__ = [
@@ -20,6 +22,7 @@ __all__ = [
     "Likelihood",
     "MLPDecoder",
     "MLPEncoder",
+    "ModelAdapter",
     "ModelFamily",
     "ModelParts",
     "Normal",
@@ -28,6 +31,8 @@ __all__ = [
     "ParticleModel",
     "PixelDecoder",
     "PixelEncoder",
+    "PosteriorModel",
+    "RecurrentModel",
     "Rollout",
     "State",
     "StateSpaceModel",
@@ -35,4 +40,5 @@ __all__ = [
     "VectorModel",
     "VectorNormal",
     "elbo_loss",
+    "has_posterior",
 ]

@@ -19,12 +19,21 @@ from forbes.models.likelihoods import Likelihood
 from forbes.models.networks import MLP, Decoder, Encoder
 from forbes.shapes import printed_by_shape
 
-__all__ = ["BeliefModel", "EncodedSequence", "FrameLogProb", "ModelFamily", "ModelParts", "Rollout", "State"]
+__all__ = ["BOUNDS", "BeliefModel", "EncodedSequence", "FrameLogProb", "ModelFamily", "ModelParts", "RecurrentModel"]
+__all__ += ["Rollout", "State"]
+
+BOUNDS = ("elbo", "reconstruction", "kl", "iwae", "fivo", "ess")
+"""Scores that need the density of a posterior."""
 
 
 @printed_by_shape
 class State(NamedTuple):
-    """The state of the recurrence."""
+    """The state of the recurrence.
+
+    Example:
+        >>> forbes.State(hidden=torch.zeros(5, 200), state=torch.zeros(5, 8))
+        State(hidden=float32 (5, 200), state=float32 (5, 8))
+    """
 
     hidden: Tensor
     """h, `(*, H)`."""
@@ -41,7 +50,7 @@ class Rollout(NamedTuple):
     state: Tensor
     """s_t, sampled from the prior, `(B, T, D)`."""
     log_prob: Tensor
-    """log p(s_t | h_t) in nats, `(B, T)`."""
+    """log p(s_t | h_t) in nats, `(B, T)`; NaN from a `ModelAdapter`."""
 
     @property
     def features(self) -> Tensor:
@@ -56,7 +65,7 @@ class EncodedSequence(NamedTuple):
     target: Tensor
     """o_t as `Likelihood.target` or `Likelihood.sample` gives it, `(B, T, *O)`."""
     embedding: Tensor
-    """e_t, `(B, T, E)`."""
+    """e_t, `(B, T, E)`; of a `ModelAdapter` any `(B, T, *E)`."""
     action: Tensor
     """a_{t-1}, `(B, T, A)`."""
 
@@ -108,7 +117,7 @@ class ModelParts(NamedTuple):
 
 
 class BeliefModel(Configurable, nn.Module, ABC):
-    """A recurrent model that holds a belief: it filters, predicts, imagines and decodes.
+    """A model that holds a belief: it filters, predicts, imagines and decodes.
 
     To add a model whose filter differs, copy `vector.py`. A subclass implements, in the order in which they are called:
 
@@ -119,27 +128,16 @@ class BeliefModel(Configurable, nn.Module, ABC):
     - `imagine`: a trajectory from such a sample, given actions and no observations.
     - `predictive_log_prob`: an estimate of log p(o_t | o_1:t-1) of every step; scores.
 
-    It may override `num_belief_samples` and `logged_terms`. Everything else is shared.
-
-    Args:
-        parts: what it is made of.
-        input_dim: dimensions of the input of the transition, before the GRU.
+    It may override `num_belief_samples`, `lacks` and `logged_terms`. Everything else is shared. `RecurrentModel` has
+    the networks of the models that are trained here; `ModelAdapter` is for a model that was trained elsewhere.
     """
 
     logged_terms: ClassVar[tuple[str, ...]] = ("reconstruction", "kl")
     """What training logs in addition to the bound: its parts, or names of `ElboTerms.auxiliary`."""
     particles: int = 1
     """Particles per sample of the belief."""
-    center: Tensor | None
-    """The mean target, `(*O)`. Encoder and decoder then work on the difference to it; None leaves both as they are."""
-
-    def __init__(self, parts: ModelParts, input_dim: int) -> None:
-        super().__init__()
-        self.hidden_dim = parts.hidden_dim
-        self.encoder, self.decoder, self.likelihood = parts.encoder, parts.decoder, parts.likelihood
-        self.transition = MLP(input_dim, parts.mlp_dim, parts.mlp_layers)
-        self.gru = nn.GRUCell(parts.mlp_dim, parts.hidden_dim)
-        self.register_buffer("center", None)
+    likelihood: Likelihood
+    """What the output of `decode` means."""
 
     @property
     @abstractmethod
@@ -188,6 +186,19 @@ class BeliefModel(Configurable, nn.Module, ABC):
             T steps after `start`, without `start` itself.
         """
 
+    @abstractmethod
+    def embed_target(self, target: Tensor) -> Tensor:
+        """Encode every frame as `Likelihood.target` or `Likelihood.sample` gives it: `(B, T, *O)` to e `(B, T, E)`."""
+
+    @abstractmethod
+    def decode(self, features: Tensor) -> Tensor:
+        """Return the likelihood's parameters: features `(*, F)` to `(*, *O)`."""
+
+    @property
+    def lacks(self) -> tuple[str, ...]:
+        """Return the scores that the model does not have: without the density of a posterior, the bounds."""
+        return BOUNDS
+
     def num_belief_samples(self, number: int) -> int:
         """Return how many independent samples of the belief have `number` particles together."""
         return number
@@ -201,21 +212,8 @@ class BeliefModel(Configurable, nn.Module, ABC):
         """Encode every frame: stored observations `(B, T, *O)` to e `(B, T, E)`."""
         return self.embed_target(self._target(observation))
 
-    def embed_target(self, target: Tensor) -> Tensor:
-        """Encode every frame as `Likelihood.target` or `Likelihood.sample` gives it: `(B, T, *O)` to e `(B, T, E)`."""
-        shown = target if self.center is None else target - self.center
-        embedding: Tensor = self.encoder(shown.flatten(0, 1)).to(target.dtype)  # (B T, E)
-        return embedding.view(*target.shape[:2], -1)  # (B, T, E)
-
     def _target(self, observation: Tensor) -> Tensor:
-        return self.likelihood.target(observation).to(self.gru.weight_hh.dtype)
-
-    def decode(self, features: Tensor) -> Tensor:
-        """Return the likelihood's parameters: features `(*, F)` to `(*, *O)`."""
-        output: Tensor = self.decoder(features.flatten(0, -2))  # (N, *O)
-        if self.center is not None:
-            output = output + self.center
-        return output.view(*features.shape[:-1], *output.shape[1:])  # (*, *O)
+        return self.likelihood.target(observation)
 
     def log_likelihood(self, features: Tensor, target: Tensor) -> Tensor:
         """Return log p(o | features) in nats: `(*, F)` and `(*, *O)`, which broadcast, to `(*)`."""
@@ -224,5 +222,41 @@ class BeliefModel(Configurable, nn.Module, ABC):
         return self.likelihood.log_prob(output.to(precise), target)
 
 
-ModelFamily: TypeAlias = Callable[[ModelParts], BeliefModel]
+class RecurrentModel(BeliefModel):
+    """The networks of a model that is trained here: encoder, transition, GRU and decoder.
+
+    Args:
+        parts: what it is made of.
+        input_dim: dimensions of the input of the transition, before the GRU.
+    """
+
+    center: Tensor | None
+    """The mean target, `(*O)`. Encoder and decoder then work on the difference to it; None leaves both as they are."""
+
+    def __init__(self, parts: ModelParts, input_dim: int) -> None:
+        super().__init__()
+        self.hidden_dim = parts.hidden_dim
+        self.encoder, self.decoder, self.likelihood = parts.encoder, parts.decoder, parts.likelihood
+        self.transition = MLP(input_dim, parts.mlp_dim, parts.mlp_layers)
+        self.gru = nn.GRUCell(parts.mlp_dim, parts.hidden_dim)
+        self.register_buffer("center", None)
+
+    def embed_target(self, target: Tensor) -> Tensor:
+        """See `BeliefModel.embed_target`."""
+        shown = target if self.center is None else target - self.center
+        embedding: Tensor = self.encoder(shown.flatten(0, 1)).to(target.dtype)  # (B T, E)
+        return embedding.view(*target.shape[:2], -1)  # (B, T, E)
+
+    def _target(self, observation: Tensor) -> Tensor:
+        return self.likelihood.target(observation).to(self.gru.weight_hh.dtype)
+
+    def decode(self, features: Tensor) -> Tensor:
+        """See `BeliefModel.decode`."""
+        output: Tensor = self.decoder(features.flatten(0, -2))  # (N, *O)
+        if self.center is not None:
+            output = output + self.center
+        return output.view(*features.shape[:-1], *output.shape[1:])  # (*, *O)
+
+
+ModelFamily: TypeAlias = Callable[[ModelParts], RecurrentModel]
 """Builds a model from its parts: a class of this package with its other arguments bound."""

@@ -77,9 +77,14 @@ class MLP(nn.Sequential):
 
     def prepare(self, known: Tensor, loop: TimeLoop) -> Callable[[Tensor], Tensor]:
         """Return the network of [x, known] as a function of x, for the steps of a loop (see `prepare_mlp`)."""
-        pairs = [(block.get_submodule("0"), block.get_submodule("1")) for block in self.children()]
-        layers = [Layer(a.weight, a.bias, _FUNCTIONS[type(b)], tuple(b.parameters())) for a, b in pairs]
+        layers = [_layer(*block.children()) for block in self.children()]
         return prepare_mlp(layers, known, loop)
+
+
+def _layer(linear: nn.Module, activation: nn.Module) -> Layer:
+    """Return a linear layer and its activation for a time loop."""
+    weight, bias = linear.get_parameter("weight"), linear.get_parameter("bias")
+    return Layer(weight, bias, _FUNCTIONS[type(activation)], tuple(activation.parameters()))
 
 
 def activate(module: nn.Module, activation: Activation) -> None:
@@ -87,7 +92,8 @@ def activate(module: nn.Module, activation: Activation) -> None:
     for part in module.modules():
         if isinstance(part, MLP):
             for block in part.children():
-                block.add_module("1", _ACTIVATIONS[activation](block.get_submodule("0").out_features))
+                width = len(block.get_submodule("0").get_parameter("bias"))
+                block.add_module("1", _ACTIVATIONS[activation](width))
 
 
 class Encoder(Configurable, nn.Module):

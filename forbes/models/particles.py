@@ -23,7 +23,8 @@ from torch import Tensor
 from forbes.errors import ForbesError, require_at_least
 from forbes.models.base import EncodedSequence, FrameLogProb, ModelParts, State
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.state_space import Filtered, StateSpaceModel
+from forbes.models.posterior import Filtered, PosteriorModel
+from forbes.models.state_space import StateSpaceModel
 from forbes.performance.precision import full_precision
 from forbes.shapes import printed_by_shape
 
@@ -100,7 +101,7 @@ def soft(log_weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def run_particles(
-    model: StateSpaceModel,
+    model: PosteriorModel,
     encoded: EncodedSequence,
     number: int,
     resampling: Resampling,

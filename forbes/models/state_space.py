@@ -12,49 +12,24 @@ it, once over (B·T).
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import softplus
 
 from forbes.beliefs import BeliefHead
 from forbes.errors import require_at_least
-from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
+from forbes.models.base import EncodedSequence, ModelParts, RecurrentModel, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.networks import MLP
+from forbes.models.posterior import Filtered, PosteriorModel
 from forbes.performance.precision import full_precision
 from forbes.performance.recurrence import prepare_gru
 from forbes.performance.time_loop import TimeLoop
-from forbes.shapes import printed_by_shape
 
-__all__ = ["Filtered", "StateSpaceModel"]
-
-
-@printed_by_shape
-class Filtered(NamedTuple):
-    """A trajectory of the posterior, and what the bound and further samples need; a single step has no T."""
-
-    hidden: Tensor
-    """h_t, `(B, T, H)`."""
-    state: Tensor
-    """s_t, drawn from the posterior, `(B, T, D)`."""
-    context: Tensor
-    """The posterior's context of (h_t, e_t), `(B, T, C)`."""
-    log_prob: Tensor
-    """log q(s_t | h_t, e_t) in nats, `(B, T)`."""
-
-    @property
-    def features(self) -> Tensor:
-        """[h_t, s_t], the input of every decoder, `(B, T, H + D)`."""
-        return torch.cat((self.hidden, self.state), -1)  # (B, T, H + D)
-
-    def at(self, time: int) -> State:
-        """Return (h, s) at one step, from which the filter can continue."""
-        return State(self.hidden[:, time], self.state[:, time])  # (B, H), (B, D)
+__all__ = ["StateSpaceModel"]
 
 
-class StateSpaceModel(BeliefModel):
+class StateSpaceModel(PosteriorModel, RecurrentModel):
     """RSSM with any belief family: Gaussian gives PlaNet's and Dreamer's, flow gives FORBES.
 
     Args:
@@ -106,18 +81,10 @@ class StateSpaceModel(BeliefModel):
         return Filtered(hidden, state, context, log_prob)
 
     def prepare_step(self, embedding: Tensor, action: Tensor, copies: int = 1) -> Callable[[State], Filtered]:
-        """Return `step` for a loop over a sequence: the same numbers, faster (`forbes.performance.time_loop`).
+        """See `PosteriorModel.prepare_step`: the numbers of `step`, faster (`forbes.performance.time_loop`).
 
         What does not depend on (h, s) is hoisted out of the loop: the terms of e_t and a_{t-1} in the first layers (one
         product over all steps each), the weights that a flow merges, and the gradients of the weights.
-
-        Args:
-            embedding: e_t, `(B, T, E)`.
-            action: a_{t-1}, the action that led to o_t, `(B, T, A)`.
-            copies: N, copies of each sequence that are filtered side by side.
-
-        Returns:
-            The step, to be called at most T times: (h, s) before it to those after it, `(N B, ...)`, copy-major.
         """
         loop = TimeLoop(steps=embedding.shape[1], batch=copies * len(embedding))
         transition = self.transition.prepare(action, loop)
@@ -134,17 +101,7 @@ class StateSpaceModel(BeliefModel):
         return step
 
     def filter(self, embedding: Tensor, action: Tensor, start: State | None = None) -> Filtered:
-        """Run the posterior along a sequence.
-
-        Args:
-            embedding: e_t, `(B, T, E)`.
-            action: a_{t-1}, the action that led to o_t, `(B, T, A)`.
-            start: (h, s) before the first step; (h_0, s_0) = 0 by default.
-
-        Returns:
-            One trajectory of (h_t, s_t) per sequence. It is causal: for the same noise, a prefix of the input gives the
-            prefix of the output.
-        """
+        """See `PosteriorModel.filter`: from (h_0, s_0) = 0 by default."""
         state = start or self.initial(len(embedding))
         step: Callable[[State], Filtered]
         steps: list[Filtered] = []
@@ -159,7 +116,7 @@ class StateSpaceModel(BeliefModel):
         return Filtered(*(torch.stack(values, 1) for values in zip(*steps, strict=True)))  # (B, T, ...)
 
     def prior_log_prob(self, filtered: Filtered) -> Tensor:
-        """Return log p(s_t | h_t) of the posterior's samples in nats, `(B, T)`."""
+        """See `PosteriorModel.prior_log_prob`."""
         with full_precision(filtered.state):
             return self.prior.log_prob(filtered.state, self.prior_context(filtered.hidden))
 
@@ -211,46 +168,15 @@ class StateSpaceModel(BeliefModel):
         action = encoded.action.repeat(samples, 1, 1)  # (N B, T, A)
         return self.filter(embedding, action).at(-1)  # (N B, ...)
 
-    def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
-        """See `BeliefModel.predictive_log_prob`: along one posterior trajectory."""
-        filtered = self.filter(encoded.embedding, encoded.action)
-
-        def score(features: Tensor) -> Tensor:
-            log_prob = log_likelihood(features.flatten(0, 1), encoded.target.flatten(0, 1))  # (B T,)
-            return log_prob.view(features.shape[:2])  # (B, T)
-
-        return self.one_step_log_prob(filtered, score(filtered.features), score)
-
-    def one_step_log_prob(
-        self, filtered: Filtered, reconstruction: Tensor, log_likelihood: Callable[[Tensor], Tensor]
-    ) -> Tensor:
-        r"""Estimate log p(o_t | h_t), in nats, from a sample of the prior and the posterior's.
-
-        .. math:: \hat p(o_t \mid h_t) = \sum_{s \in \{\tilde s_t,\, s_t\}} p(o_t \mid h_t, s)\,
-                  \frac{p(s \mid h_t)}{p(s \mid h_t) + q(s \mid h_t, e_t)}, \qquad
-                  \tilde s_t \sim p(\cdot \mid h_t), \quad s_t \sim q(\cdot \mid h_t, e_t)
-
-        This is multiple importance sampling with the balance heuristic (Veach and Guibas, 1995): unbiased for every
-        posterior. The prior rarely finds an o_t that leaves few states possible. The posterior finds them, and no
-        weight can exceed 1, however narrow it is.
-
-        Args:
-            filtered: from `filter`, any leading shape `(*)`.
-            reconstruction: log p(o_t | h_t, s_t), `(*)`.
-            log_likelihood: log p(o_t | features) of features `(*, H + D)`, to `(*)`.
-
-        Returns:
-            `(*)`, in the dtype of `reconstruction`.
-        """
+    def posterior_log_prob(self, state: Tensor, filtered: Filtered) -> Tensor:
+        """See `PosteriorModel.posterior_log_prob`."""
         with full_precision(filtered.state):
-            context = self.prior_context(filtered.hidden)
-            sample, log_prior = self.prior.rsample(context)  # (*, D), (*)
-            log_posterior = self.posterior.log_prob(sample, filtered.context)
-            log_prior_at_posterior = self.prior.log_prob(filtered.state, context)
-        prediction = log_likelihood(torch.cat((filtered.hidden, sample), -1))
-        by_prior = prediction + _log_share(log_prior, log_posterior)
-        by_posterior = reconstruction + _log_share(log_prior_at_posterior, filtered.log_prob)
-        return torch.logaddexp(by_prior, by_posterior)
+            return self.posterior.log_prob(state, filtered.context)
+
+    def sample_prior(self, filtered: Filtered) -> tuple[Tensor, Tensor]:
+        """See `PosteriorModel.sample_prior`."""
+        with full_precision(filtered.state):
+            return self.prior.rsample(self.prior_context(filtered.hidden))
 
     def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """See `BeliefModel.lower_bound`: with one posterior trajectory per sequence."""
@@ -268,8 +194,3 @@ class StateSpaceModel(BeliefModel):
                 log_posterior = self.posterior.path_log_prob(filtered.state, filtered.context)  # (B, T)
             sampled = log_posterior - self.prior.log_prob(filtered.state, prior_context)  # (B, T)
         return ElboTerms(reconstruction, sampled, analytic, mask)
-
-
-def _log_share(log_p: Tensor, log_q: Tensor) -> Tensor:
-    """Return log p / (p + q)."""
-    return -softplus(log_q - log_p)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from forbes.distributed import masked_sums
 from forbes.errors import ForbesError, require_at_least
-from forbes.models.base import BeliefModel, EncodedSequence, FrameLogProb, ModelParts, Rollout, State
+from forbes.models.base import EncodedSequence, FrameLogProb, ModelParts, RecurrentModel, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.performance.precision import full_precision
 from forbes.performance.recurrence import prepare_gru
@@ -26,7 +26,7 @@ from forbes.performance.time_loop import TimeLoop
 __all__ = ["VectorModel"]
 
 
-class VectorModel(BeliefModel):
+class VectorModel(RecurrentModel):
     """A deterministic recurrent model; the pair it carries is (h_t, e_t), what it believed and what it then saw.
 
     Args:

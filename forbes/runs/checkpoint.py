@@ -127,6 +127,8 @@ class SaveLast(Checkpoint):
         Raises:
             ForbesError: if not even the weights fit once.
         """
+        if not trainer.is_global_zero:
+            return
         weights = sum(values.numel() * values.element_size() for values in pl_module.state_dict().values())
         missing = 4 - len([*self.run.checkpoint.parent.glob("*.ckpt")])
         require_room(self.run.path, "checkpoints", likely=3 * weights * max(missing, 1), least=weights)

@@ -24,7 +24,7 @@ from forbes.models import Likelihood
 from forbes.pomdps import Process
 
 __all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "changed_defaults", "data_paths"]
-__all__ += ["experiment_parser", "require_classes"]
+__all__ += ["data_parser", "experiment_parser", "require_classes"]
 
 _OF_FORBES = ("beliefs", "callbacks", "data", "models", "pomdps", "training")
 _OF_LIGHTNING = ("accelerators", "callbacks", "loggers", "plugins", "profilers", "strategies")
@@ -159,4 +159,11 @@ def experiment_parser() -> LightningArgumentParser:
     parser.add_lightning_class_args(LightningModule, "model", subclass_mode=True)
     parser.add_lightning_class_args(SequenceDataModule, "data", subclass_mode=True)
     add_links(parser)
+    return parser
+
+
+def data_parser() -> LightningArgumentParser:
+    """Return a parser for the data alone."""
+    parser = LightningArgumentParser(exit_on_error=False)
+    parser.add_lightning_class_args(SequenceDataModule, "data", subclass_mode=True)
     return parser

@@ -116,8 +116,12 @@ def experiment_name(configs: Sequence[str]) -> str:
     return parts[-1]
 
 
-def read_config(path: Path) -> dict[str, Any]:
+def read_config(path: Path, sections: Sequence[str] = ("model", "data")) -> dict[str, Any]:
     """Read the config.yaml of a run, with the current public name of each class.
+
+    Args:
+        path: the file.
+        sections: sections that it must have.
 
     Raises:
         ForbesError: if it is not a file written by `forbes fit`.
@@ -125,8 +129,10 @@ def read_config(path: Path) -> dict[str, Any]:
     remedy = "Restore it, or name another run"
     config = read_yaml(path, remedy)
     if not isinstance(config, dict):
-        raise ForbesError(f"{path}: holds a {type(config).__name__}, expected sections model and data. {remedy}")
-    for name in ("model", "data"):
+        raise ForbesError(
+            f"{path}: holds a {type(config).__name__}, expected sections {' and '.join(sections)}. {remedy}"
+        )
+    for name in sections:
         section = config.get(name)
         if not isinstance(section, dict) or not isinstance(section.get("class_path"), str):
             raise ForbesError(f"{path}: its section {name} has no class_path, expected the name of a class. {remedy}")

@@ -6,16 +6,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
+from jsonargparse import Namespace
 from lightning import LightningModule
+from lightning.pytorch.cli import LightningArgumentParser
 from torch import Tensor, nn
 
 from forbes.data import Experience, SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.runs.checkpoint import open_checkpoint
 from forbes.runs.config_errors import building, one_sentence
+from forbes.runs.configs import find_config
 from forbes.runs.configuration import (
     allow_modules,
     changed_defaults,
+    data_parser,
     data_paths,
     experiment_parser,
     require_classes,
@@ -23,7 +27,7 @@ from forbes.runs.configuration import (
 from forbes.runs.folder import RunFolder, read_config
 from forbes.runs.hyperparameters import build_arguments, plain_arguments
 
-__all__ = ["LoadedRun", "build_run", "check_weights", "load_module", "open_module", "weights_of"]
+__all__ = ["LoadedRun", "build_data", "build_run", "check_weights", "load_module", "open_module", "weights_of"]
 
 Module = TypeVar("Module", bound=LightningModule)
 
@@ -105,27 +109,54 @@ def build_run(
     config = read_config(folder.config)
     for key, value in {**changed_defaults(config), **changes}.items():
         _put(config, key, value)
-    allow_modules()
+    sections: dict[str, Any] = {key: config[key] for key in ("seed_everything", "model", "data") if key in config}
     parser = experiment_parser()
-    sections = {key: config[key] for key in ("seed_everything", "model", "data") if key in config}
-    try:
-        with building(str(folder.config)):
-            parsed = parser.parse_object(sections)
-    except argparse.ArgumentError as error:
-        raise ForbesError(f"{folder.config}: {one_sentence(str(error))}") from error
-    try:
-        require_classes(parsed)
-    except ForbesError as error:
-        raise ForbesError(f"{folder.config}: {error}") from error
-    for key, path in data_paths(parsed["data"]).items():
-        if not Path(path).exists():
-            name = "data." + key.replace("init_args.", "")
-            raise ForbesError(
-                f"{folder.config}: {name} is {path}, which does not exist. Set it to the path of the data"
-            )
+    parsed = _parse(parser, sections, folder.config)
     with building(str(folder.config)):
         built = parser.instantiate(parsed, instantiators=[(partial(_recalled, folder.path), Experience, True)])
     return built.model, built.data, config
+
+
+def build_data(where: str) -> SequenceDataModule:
+    """Build the data of a run or of a configuration, without its model.
+
+    Args:
+        where: run folder, `pretrained:NAME`, or the name or file of a configuration.
+
+    Raises:
+        ForbesError: if there is no such thing, or its data do not exist.
+    """
+    folder = RunFolder(where)
+    is_run = folder.config.is_file()
+    file = folder.config if is_run else find_config(where)
+    config = read_config(file, ("data",))
+    for key, value in changed_defaults(config).items() if is_run else ():
+        _put(config, key, value)
+    parser = data_parser()
+    parsed = _parse(parser, {"data": config["data"]}, file)
+    with building(str(file)):
+        built = parser.instantiate(parsed, instantiators=[(partial(_recalled, folder.path), Experience, True)])
+    data: SequenceDataModule = built.data
+    return data
+
+
+def _parse(parser: LightningArgumentParser, sections: Mapping[str, Any], file: Path) -> Namespace:
+    """Parse sections of a configuration; refuse classes that are not allowed, and data that do not exist."""
+    allow_modules()
+    try:
+        with building(str(file)):
+            parsed: Namespace = parser.parse_object(dict(sections))
+    except argparse.ArgumentError as error:
+        raise ForbesError(f"{file}: {one_sentence(str(error))}") from error
+    try:
+        require_classes(parsed)
+    except ForbesError as error:
+        raise ForbesError(f"{file}: {error}") from error
+    for key, path in data_paths(parsed["data"]).items():
+        if not Path(path).exists():
+            name = "data." + key.replace("init_args.", "")
+            raise ForbesError(f"{file}: {name} is {path}, which does not exist. Set it to the path of the data")
+    return parsed
 
 
 def _recalled(run: Path, kind: type[Experience], **arguments: Any) -> Experience:

@@ -59,6 +59,7 @@ class RecordRun(SaveConfigCallback):
         super().__init__(parser, config, save_to_log_dir=False)
         self.run, self.stop, self.arguments = run, stop, arguments
         self._began = time.monotonic()
+        self._entries: list[dict[str, Any]] = []  # stays empty in all processes of a training but the first
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Write both files before the training starts, and log the configuration as hyperparameters."""
@@ -84,7 +85,7 @@ class RecordRun(SaveConfigCallback):
             self._end(self.stop.exit_status if stopped else failed)
 
     def _end(self, exit_status: int) -> None:
-        if self.already_saved:
+        if self._entries:
             hours = round((time.monotonic() - self._began) / 3600, 4)
             self._entries[-1] |= {"hours": hours, "exit_status": exit_status}
             self._write()

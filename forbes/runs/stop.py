@@ -10,7 +10,9 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from forbes.data import Experience
 from forbes.data.datamodule import datamodule_of
+from forbes.distributed import greatest
 from forbes.runs.folder import RunFolder
+from forbes.runs.launched import is_first
 
 __all__ = ["StopOnSignal"]
 
@@ -41,7 +43,6 @@ class StopOnSignal(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Replace Lightning's signal handlers, which Lightning restores after the training."""
-        self._end_loop = signal.getsignal(signal.SIGTERM)
         self._whole_epochs = isinstance(datamodule_of(trainer).source, Experience)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._receive)
@@ -53,11 +54,11 @@ class StopOnSignal(Callback):
         """End the loop after this update, unless a validation follows, which must be completed."""
         updates = (batch_idx + 1) % trainer.accumulate_grad_batches == 0  # a checkpoint has no half-summed gradients
         if updates and not trainer.is_last_batch and not self._whole_epochs:
-            self._end()
+            self._end(trainer)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """End the loop after this epoch."""
-        self._end()
+        self._end(trainer)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Save a checkpoint if a signal ended the loop."""
@@ -68,9 +69,12 @@ class StopOnSignal(Callback):
         if self.received is not None:
             raise SystemExit(128 + number)
         self.received = number
-        if self._whole_epochs:  # may take minutes; os.write, since the signal may have interrupted a print
+        if self._whole_epochs and is_first():  # may take minutes
+            # `os.write`, since the signal may have interrupted a print
             os.write(2, b"\nstopping after this epoch; once more to stop immediately, and lose it\n")
 
-    def _end(self) -> None:
-        if self.received is not None and callable(self._end_loop):
-            self._end_loop(signal.SIGTERM, None)
+    def _end(self, trainer: Trainer) -> None:
+        """End the loop if any process of the training has received a signal, in all of them."""
+        if received := greatest(self.received or 0, trainer.strategy.root_device):
+            self.received = received
+            cast(Any, trainer)._signal_connector.received_sigterm = True

@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, cast
 
 import torch
@@ -133,7 +134,7 @@ class SeededModule(LightningModule, ABC):
         """Log the means over all batches of all ranks."""
         self.log_dict({f"{split}/{name}": value for name, value in self._means.compute().items()})
 
-    def log_split(self, split: str, values: dict[str, Tensor], batch: SequenceBatch) -> None:
+    def log_split(self, split: str, values: Mapping[str, Tensor], batch: SequenceBatch) -> None:
         """Log scalars of a batch by name, as `train/name`."""
         self.log_dict({f"{split}/{name}": value for name, value in values.items()}, batch_size=len(batch.mask))
 

@@ -138,6 +138,24 @@ def test_replay_repeats_noise_batches_and_weight_of_the_kl(tiny_config, tmp_path
     assert seen[-2:] == trained
 
 
+def test_replay_repeats_the_noise_and_the_rows_of_each_process(diverged, monkeypatch):
+    run, *_ = diverged
+    failure = read_checkpoint(run.failure)
+    AtomicCheckpointIO().save_checkpoint(failure | {"processes": 2}, run.failure)
+    [batch], seen = failure["batches"], []
+
+    def remember(self, share):
+        seen.append((share.observation, torch.initial_seed()))
+        return LossTerm(sum(parameter.sum() for parameter in self.parameters()), {})
+
+    monkeypatch.setattr(WorldModel, "total_loss", remember)
+    assert main(["replay", str(run.failure)]) == 2  # this loss is finite
+
+    assert torch.equal(torch.cat([rows for rows, _ in seen]), batch["observation"])
+    purposes = ("update", "update/1")
+    assert [seed for _, seed in seen] == [derive_seed(failure["seed"], purpose, 11) for purpose in purposes]
+
+
 def change(failure, **values):
     return {name: value for name, value in (failure | values).items() if value is not None}
 
@@ -154,6 +172,7 @@ def test_replay_of_no_file_is_one_sentence(tiny_run, capsys):
         ({"update": None}, "its update is NoneType, expected the failure.pt of a run that diverged"),
         ({"batches": [{}]}, "one of its batches lacks a field"),
         ({"batches": []}, "it does not have one number per batch"),
+        ({"processes": 3}, "its batches cannot be shared by 3 processes"),
         ({"state_dict": {}}, "it has no model."),
     ],
 )

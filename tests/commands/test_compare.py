@@ -210,7 +210,7 @@ def test_it_goes_on_where_it_was_stopped(configs, tmp_path, monkeypatch):
 
     assert main(command) == 0
 
-    assert measured == [[str(tmp_path / "forbes-0")]]
+    assert [[run.path for run in runs] for runs in measured] == [[str(tmp_path / "forbes-0")]]
     assert len((tmp_path / "comparison.md").read_text().splitlines()) > 4
     for name in ("rssm", "forbes"):
         metrics = (tmp_path / f"{name}-0" / "metrics.jsonl").read_text().splitlines()

@@ -19,6 +19,7 @@ from forbes.commands.evaluate import evaluate as measure
 from forbes.errors import ForbesError
 from forbes.evaluation import scoring
 from forbes.evaluation.metrics import EvaluatedRun, compare_pairs
+from forbes.evaluation.record import results_folders
 from forbes.evaluation.references import references
 from forbes.evaluation.runs import load_runs, split_batches
 from forbes.evaluation.scoring import PartialScores, make_scorer, score_split
@@ -223,7 +224,8 @@ def test_a_score_that_a_model_does_not_have_is_left_out_and_said(runs, other_fil
 
 def test_impossible_scores_and_numbers_are_one_sentence(other_filters, capsys):
     vector, particle = other_filters
-    expected = "a Vector model has no elbo or fivo score, its likelihood is exact. Ask for --scores pll or open-loop"
+    expected = "a Vector model has no elbo or fivo score, since it has no density of a posterior. Ask for --scores pll "
+    expected += "or open-loop"
     assert expected in refusal(capsys, vector, "--scores", "elbo", "fivo")
     message = refusal(capsys, particle, "--scores", "pll", "--particles", "3")
     assert "3 particles or futures, expected whole sets of 2" in message
@@ -410,7 +412,7 @@ def evaluated(runs, number, score):
         sequences=5, samples=2, particles=2, futures=2, context=2, batch_size=5, seed=0, device="cpu", split="test",
         scores=[score],
     )  # fmt: skip
-    found = measure(runs[:1], args, "")
+    found = measure(load_runs(runs[:1]), args, "", results_folders(runs[:1]))
     one = found[0]
     entry = next(values for name, values in one.entries.items() if "/elbo[" in name)
     names = [runs[0], *(f"runs/compare/a-rather-long-name-of-a-run-{k}" for k in range(1, number))]

@@ -1,14 +1,24 @@
-"""`forbes rollout`: the video is of the episodes that `forbes evaluate` measures."""
+"""`forbes rollout`: the video is of the episodes that `forbes evaluate` measures, in front of a camera if need be."""
 
 import io
+from functools import partial
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageSequence
 from small_agents import fit, forbes, write_config, write_image_config
+from toy_environments import Parrot
 
+from forbes import GaussianBelief, MLPDecoder, MLPEncoder, VectorNormal, WorldModel
+from forbes.data.episodes.collection import play, random_policy
+from forbes.envs import Environment, Step
+from forbes.envs.views import look_through
+from forbes.errors import ForbesError
 from forbes.evaluation.agents import play_test_episode
+from forbes.evaluation.films import camera_of, film
 from forbes.evaluation.record import read_record
+from forbes.figures.dreams import curves, dream
 from forbes.training.loading import load_run
 
 
@@ -50,7 +60,7 @@ def test_refuses_what_cannot_be_filmed(run, tiny_run, tmp_path, capsys):
     capsys.readouterr()
 
     for arguments, message in [
-        ((run, "--video", tmp_path / "agent.mp4"), "agent.mp4: it ends in .mp4, expected .gif. Rename it"),
+        ((run, "--video", tmp_path / "agent.avi"), "agent.avi: it ends in .avi, expected .gif or .mp4. Rename it"),
         ((run, "--video", "/proc/agent.gif"), "/proc/"),
         ((run, "--video", tmp_path / "a.gif", "--device", "cuda:9"), "--device cuda:9: it cannot be used"),
         ((tiny_run, "--video", tmp_path / "a.gif"), "not the run of an agent, but of a WorldModel"),
@@ -63,3 +73,111 @@ def test_refuses_what_cannot_be_filmed(run, tiny_run, tmp_path, capsys):
         assert error.count("\n") == 1
     assert f"forbes evaluate {vectors}" in error
     assert not list(tmp_path.glob("*.gif"))
+
+
+def frames_of(path):
+    film = Image.open(io.BytesIO(path.read_bytes()))
+    return np.stack([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)])
+
+
+def test_imagined_frames_are_beside_those_that_happened(run, tmp_path):
+    path, plain = tmp_path / "dream.gif", tmp_path / "plain.gif"
+
+    assert forbes("rollout", run, "--video", path, "--imagine", 4, "--seed", 3) == 0
+    assert forbes("rollout", run, "--video", plain, "--seed", 3) == 0
+
+    frames, happened = frames_of(path), frames_of(plain)
+    assert frames.shape[1:] == (14 + 256, 2 * 256 + 3 * 4, 3)
+    assert len(frames) == len(happened)
+    error = np.abs(frames[:, 14:, 4:260].astype(int) - happened)
+    assert np.median(error) == 0  # but for the palette of 256 colours, which two pictures share
+    assert not np.array_equal(frames[:, 14:, 264:520], happened)
+
+
+def test_a_grid_is_as_long_as_its_longest_episode(run, tmp_path):
+    assert forbes("rollout", run, "--video", tmp_path / "grid.gif", "--episodes", 3, "--grid") == 0
+
+    assert frames_of(tmp_path / "grid.gif").shape == (10, 2 * 256, 2 * 260 + 4, 3)
+
+
+class Dial(Environment):
+    """A number that the action moves, or, with `pixels`, a bar of that length; the camera may lie about the reward."""
+
+    action_dim = 1
+
+    def __init__(self, pixels=False, lies=False, steps=7):
+        self.pixels, self.lies, self.steps = pixels, lies, steps
+        self.observation_shape = (3, 8, 8) if pixels else (2,)
+
+    def reset(self, seed):
+        self.time, self.place = 0, seed % 4
+        return Step(self.observed())
+
+    def step(self, action):
+        self.time += 1
+        self.place = float(np.clip(self.place + action[0], 0, 8))
+        return Step(self.observed(), self.place + self.lies * self.pixels, truncated=self.time == self.steps)
+
+    def observed(self):
+        if not self.pixels:
+            return np.array([self.place, self.time], np.float32)
+        frame = np.zeros((3, 8, 8), np.uint8)
+        frame[:, :, : round(self.place)] = 255
+        return frame
+
+
+def test_an_episode_is_the_same_in_front_of_the_camera():
+    seen = look_through(partial(Dial), {"hide": 1, "delay": 2})
+    episode = play(seen, random_policy(seen, 1), seed=6)
+    make = camera_of(partial(look_through, partial(Dial), {"hide": 1, "delay": 2}))
+
+    frames = film(make(), episode, seed=6)
+
+    places = np.concatenate([[6 % 4], episode.reward[1:]]).round()
+    np.testing.assert_array_equal(frames[:, 0, 0].sum(-1) / 255, places)
+    with pytest.raises(ForbesError, match="the same seed and actions earn other rewards with pixels than without"):
+        film(Dial(pixels=True, lies=True), episode, seed=6)
+    assert camera_of(Parrot) is None
+
+
+def test_imagination_is_the_posterior_where_it_starts_and_the_prior_after():
+    model = WorldModel(
+        observation_shape=(2,),
+        action_dim=1,
+        encoder=partial(MLPEncoder, width=4, layers=1),
+        decoder=partial(MLPDecoder, width=4, layers=1),
+        likelihood=VectorNormal(),
+        belief=GaussianBelief,
+        state_dim=2,
+        hidden_dim=3,
+        mlp_dim=4,
+    ).model.eval()
+    environment = Dial(steps=9)
+    episode = play(environment, random_policy(environment, 1), seed=6)
+    changed = episode.observation.copy()
+    changed[[1, 2, 3, 5, 6, 7, 9]] += 100  # what is imagined does not depend on what is seen meanwhile
+
+    imagined, other = (dream(model, e, horizon=3, seed=0) for e in (episode, episode._replace(observation=changed)))
+
+    assert imagined.shape == (10, 2)
+    torch.testing.assert_close(imagined[:4], other[:4])
+    assert not torch.equal(imagined[4:], other[4:])  # from here on it has seen the change
+
+
+def test_curves_have_a_line_at_the_present_step():
+    seen = np.random.default_rng(0).normal(size=(20, 11)).astype(np.float32)
+
+    frames = curves(seen, seen + 1, horizon=4, height=256)
+
+    assert frames.shape == (20, 3, 256, 384)
+    moved = [np.flatnonzero((frames[t] != frames[0]).any((0, 1))).max() for t in range(1, 20)]
+    assert moved == sorted(set(moved))
+
+
+def test_an_agent_of_vectors_is_drawn_as_curves(tmp_path):
+    vectors = tmp_path / "vectors"
+    assert fit("--config", write_config(tmp_path), "--run_dir", vectors, "--trainer.max_epochs", 1) == 0
+
+    assert forbes("rollout", vectors, "--video", tmp_path / "a.gif", "--imagine", 3) == 0
+
+    assert frames_of(tmp_path / "a.gif").shape == (9, 14 + 256, 384 + 8, 3)

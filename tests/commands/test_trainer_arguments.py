@@ -15,15 +15,14 @@ from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder, read_metrics
 from forbes.training import seeded
 
-ONE_DEVICE = "A training uses one device"
+DEVICES = "expected a number above 0, or indices as [0,1]. The noise depends on the number"
 FLOAT32 = "expected 32-true or bf16-mixed. Densities and the recurrence are computed in float32"
 REFUSED = [
-    ("devices", "2", f"is 2, expected 1, or the index of one as [0]. {ONE_DEVICE}"),
-    ("devices", "0", "is 0, expected 1, or the index of one as [0]"),
-    ("devices", "auto", "is auto, expected 1, or the index of one as [0]"),
-    ("devices", "[0,1]", "is [0, 1], expected 1, or the index of one as [0]"),
-    ("num_nodes", "2", f"is 2, expected 1. {ONE_DEVICE}"),
-    ("strategy", "ddp", f"is ddp, expected auto. {ONE_DEVICE}"),
+    ("devices", "0", f"is 0, {DEVICES}"),
+    ("devices", "-1", f"is -1, {DEVICES}"),
+    ("devices", "auto", f"is auto, {DEVICES}"),
+    ("num_nodes", "2", "is 2, expected 1. Start the processes on several machines with torchrun or SLURM"),
+    ("strategy", "fsdp", "is fsdp, expected auto or ddp. Each device has the whole model"),
     ("precision", "64-true", f"is 64-true, {FLOAT32}"),
     ("precision", "bf16-true", f"is bf16-true, {FLOAT32}"),
     ("precision", "16-mixed", f"is 16-mixed, {FLOAT32}"),

@@ -87,4 +87,5 @@ def test_two_ranks_make_the_update_of_one_process(kind, on_two_ranks, noise_of_r
     for of_rank in on_two_ranks:
         for ours, theirs in zip(of_rank[kind], alone, strict=True):
             assert ours.keys() == theirs.keys()
-            torch.testing.assert_close(ours, theirs, rtol=rtol, atol=atol)
+            torch.testing.assert_close(ours, theirs, rtol=rtol, atol=atol, equal_nan=True)
+        assert all(values.isfinite().all() for values in of_rank[kind][-1].values())  # weights

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import RunsParser, positive
 
 __all__ = ["parser"]
 
@@ -19,10 +19,9 @@ classifier tries to separate sampled states from samples of the beliefs. Prints 
 calibration.pdf."""
 
 
-def parser() -> ArgumentParser:
+def parser() -> RunsParser:
     """Return the parser of `forbes calibrate`."""
-    command = ArgumentParser("forbes calibrate", _DESCRIPTION)
-    command.add_argument("runs", nargs="+", metavar="RUN", help="run folder written by `forbes fit`")
+    command = RunsParser("forbes calibrate", _DESCRIPTION, "run folder written by `forbes fit`")
     command.add_argument(
         "--sequences", type=positive, default=1000, help="sequences sampled from the model, N (default: 1000)"
     )

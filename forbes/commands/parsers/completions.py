@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import get_args
 
 from forbes.choices import Split
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import RunsParser, positive
 
 __all__ = ["parser"]
 
@@ -31,10 +31,9 @@ completions.json and .csv, and figures, including drawings for each prefix lengt
 hundred digits on one core."""
 
 
-def parser() -> ArgumentParser:
+def parser() -> RunsParser:
     """Return the parser of `forbes completions`."""
-    command = ArgumentParser("forbes completions", _DESCRIPTION)
-    command.add_argument("runs", nargs="+", metavar="RUN", help="run folder of strokes, written by `forbes fit`")
+    command = RunsParser("forbes completions", _DESCRIPTION, "run folder of strokes, written by `forbes fit`")
     command.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
     command.add_argument("--sequences", "--digits", type=positive, default=300, help="number of digits (default: 300)")
     command.add_argument("--samples", type=positive, default=100, help="completions per digit, N (default: 100)")

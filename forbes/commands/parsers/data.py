@@ -1,13 +1,14 @@
 """The arguments of `forbes data …`, and the functions that run its commands."""
 
 import argparse
+import functools
 import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
-from forbes.choices import Dataset, Fetched, Origin, Split
-from forbes.commands.arguments import ArgumentParser, positive, seconds
+from forbes.choices import EXPORTS, FORMATS, Dataset, Fetched, Origin, Split
+from forbes.commands.arguments import ArgumentParser, positive, rate, seconds
 from forbes.envs.tasks import TASKS
 
 __all__ = ["main", "parser"]
@@ -29,6 +30,7 @@ def parser() -> argparse.ArgumentParser:
     _add_strokes(of_data)
     _add_collect(of_data)
     _add_episodes(of_data)
+    _add_imports(of_data)
     return of_data
 
 
@@ -133,10 +135,38 @@ def _add_collect(of_data: _Parser) -> None:
     play.add_argument(
         "--fast", action="store_const", const=True, help="in DeepMind Control: no shadows, which changes the pixels"
     )
+    _add_views(play)
     play.add_argument(
         "--time-limit", type=positive, metavar="STEPS", help="truncate longer episodes (default: 100,000)"
     )
     play.add_argument("--timeout", type=seconds, help="seconds to wait for the environment (default: 60)")
+
+
+def _add_views(play: argparse.ArgumentParser) -> None:
+    """Add the options that make a task less observable."""
+    group = play.add_argument_group("less observable", "applied in the order in which they are given")
+    add = functools.partial(group.add_argument, action=_InOrder)
+    names = "names of parts, e.g. velocities, or indices from 0"
+    add("--hide", nargs="+", type=_part, metavar="PART", help=f"leave out dimensions of vectors: {names}")
+    add("--flicker", type=float, metavar="P", help="blank each observation with probability P")
+    sides = ("LEFT", "TOP", "RIGHT", "BOTTOM")
+    add("--occlude", nargs=4, type=float, metavar=sides, help="blank a box of each image, in fractions of its size")
+    add("--noise", type=float, metavar="STD", help="add Gaussian noise; for images, as a fraction of white")
+    add("--delay", type=int, metavar="STEPS", help="show each observation so many agent steps late")
+    add("--blank-until", type=int, metavar="STEPS", help="blank the first observations of each episode")
+
+
+class _InOrder(argparse.Action):
+    """Stores values so that the order of the arguments is that of the namespace."""
+
+    def __call__(self, parser: object, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        """Move the argument to the end of the namespace."""
+        vars(namespace).pop(self.dest, None)
+        setattr(namespace, self.dest, values)
+
+
+def _part(text: str) -> str | int:
+    return int(text) if text.isdecimal() else text
 
 
 def _add_episodes(of_data: _Parser) -> None:
@@ -148,3 +178,31 @@ def _add_episodes(of_data: _Parser) -> None:
     summary = "Verify every file of an episode store, move damaged ones to quarantine/; exit status 1 if there are any."
     verify = of_data.add("check", "forbes.commands.episodes:check", summary, "check episodes/cartpole")
     verify.add_argument("path", type=Path, metavar="DIR", help=_STORED)
+
+
+def _add_imports(of_data: _Parser) -> None:
+    summary = "Import recorded episodes to a new store. If interrupted, the same command resumes."
+    example = "import recordings/npz -o episodes/mine --image image --resize 64"
+    take = of_data.add("import", "forbes.commands.imports:import_", summary, example)
+    take.add_argument(
+        "path", metavar="FROM", help="file or folder of the recorded episodes, or the id of a Minari data set"
+    )
+    take.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help=f"{_STORED}, which must not exist"
+    )
+    take.add_argument("--format", choices=FORMATS, help="format of FROM (default: the one that recognises it)")
+    take.add_argument("--image", metavar="KEY", help="key of the observation, if it is an image")
+    take.add_argument("--proprio", metavar="KEY", nargs="+", help="keys of the observation, if it is a vector; joined")
+    take.add_argument("--action", metavar="KEY", help="key of the action (default: by the format's usual name)")
+    take.add_argument("--reward", metavar="KEY", help="key of the reward (default: by the usual name, else all are 0)")
+    take.add_argument("--resize", type=positive, metavar="PIXELS", help="side of the images (default: as they are)")
+    take.add_argument("--fps", type=rate, help="steps per second to keep, a fraction of the data's (default: all)")
+    take.add_argument("--dry-run", action="store_true", help="print the table of what there is, and import nothing")
+
+    summary = "Export the episodes of a store to another format, without loss."
+    give = of_data.add(
+        "export", "forbes.commands.imports:export", summary, "export episodes/mine --format hdf5 -o mine.hdf5"
+    )
+    give.add_argument("path", type=Path, metavar="STORE", help=_STORED)
+    give.add_argument("--format", choices=EXPORTS, required=True, help="format to write")
+    give.add_argument("-o", "--output", type=Path, required=True, help="file or folder to write, which must not exist")

@@ -5,7 +5,7 @@ import sys
 from typing import get_args
 
 from forbes.choices import PASSES, SUBSET, Split
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import ArgumentParser, RunsParser, positive
 
 __all__ = ["add_acting_samples", "add_output", "add_score_options", "parser"]
 
@@ -17,6 +17,7 @@ Evaluate trained models by likelihood bounds and proper scores, and compare them
   forbes evaluate runs/compare/forbes-0 --scores elbo pll --sequences 200
   forbes evaluate runs/agent/forbes-0 runs/agent/dreamer-0 --episodes 20
   forbes evaluate pretrained:strokes-forbes pretrained:strokes-rssm --sequences 100
+  forbes evaluate pretrained:strokes-forbes --model my_adapter:Model checkpoint=model.pt
 
 Scores are nats per sequence of observations, fully normalised, without free nats, as mean and standard error over
 sequences. The KL is the Monte-Carlo estimate for every family. The ELBO alone does not identify a good belief, since
@@ -35,7 +36,7 @@ bounds: its likelihood is exact, and is reported as pll. A ParticleModel uses it
 
 pll, fivo and open-loop score the first {SUBSET} sequences, as the names of the metrics show. Writes evaluation.json,
 and evaluation.npz with the scores of each sequence, to each run folder, and for pretrained:NAME to pretrained-NAME in
-the current folder. If interrupted, the same command resumes where it stopped.
+the current folder, as for --model. If interrupted, the same command resumes where it stopped.
 
 Agents play the same --episodes without exploration; their score is the return. In these episodes are also measured:
 - R² of the rewards predicted from the belief, for the current step and 1, 5 and 15 steps ahead (1 = perfect, 0 = no
@@ -57,13 +58,8 @@ pen moves for strokes, the last frame and the mean frame for images. Runs below 
 
 def parser() -> ArgumentParser:
     """Return the parser of `forbes evaluate`."""
-    command = ArgumentParser("forbes evaluate", _DESCRIPTION)
-    command.add_argument(
-        "runs",
-        nargs="+",
-        metavar="RUN",
-        help="run folder written by `forbes fit`, or a checkpoint in it; or pretrained:NAME (`forbes export --help`)",
-    )
+    runs = "run folder written by `forbes fit`, or a checkpoint in it; or pretrained:NAME (`forbes export --help`)"
+    command = RunsParser("forbes evaluate", _DESCRIPTION, runs)
     command.add_argument(
         "--checkpoint", metavar="NAME", help="checkpoint in checkpoints/ of every RUN (default: last.ckpt)"
     )

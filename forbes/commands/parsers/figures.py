@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import ArgumentParser, add_models, positive
 from forbes.figures.catalogue import find_figure
 
 __all__ = ["OPTIONS", "parser"]
@@ -20,7 +20,7 @@ of the first. A family trained with another bound than the ELBO is drawn with th
 The digits of Figure 4, unless given by --index, are the most ambiguous of each class among the first 500 test digits,
 by the labels of the 50 nearest training digits. The choice does not depend on any model."""
 
-OPTIONS = ("index", "samples", "mean", "context")
+OPTIONS = ("index", "samples", "mean", "context", "model", "data")
 """Options that belong to some figures only. They are None unless given; defaults are those of the figure."""
 
 
@@ -31,6 +31,7 @@ def parser() -> ArgumentParser:
     command.add_argument("--runs", nargs="+", metavar="RUN", help="run folders written by `forbes fit`")
     command.add_argument("-o", "--output", type=Path, default=Path("figures"), help="output folder (default: figures)")
     some = command.add_argument_group("options of some figures")
+    add_models(some)
     some.add_argument("--index", type=int, nargs="+", help="indices of the test sequences to draw")
     some.add_argument("--samples", type=positive, help="completions of each sequence (predictions: 6, simcore: 4)")
     some.add_argument(

@@ -25,9 +25,15 @@ from forbes.reading import is_number, readable, shortened
 from forbes.shapes import printed_by_shape
 
 __all__ = ["DamagedEpisodeError", "Episode", "EpisodeFile", "EpisodeRecord", "Stamp", "locate_episode", "map_episode"]
-__all__ += ["pack_episode", "problem_of", "problem_with", "read_record", "stamp_of"]
+__all__ += ["describe_episode", "pack_episode", "problem_of", "problem_with", "read_record", "stamp_of"]
 
 _ARRAYS = ("observation", "action", "reward")
+_KINDS = {
+    "observation": (("|u1", 4), ("<f4", 2)),
+    "action": (("<f4", 2),),
+    "reward": (("<f4", 1),),
+}
+"""Possible dtypes and numbers of dimensions of each array."""
 _SHOWN = 60  # characters of an invalid value in an error message
 _LOCAL_HEADER = 30  # bytes before the name of a member of a zip archive
 
@@ -41,6 +47,13 @@ class Episode(NamedTuple):
         observation  o1  o2  o3
         action       0   a1  a2
         reward       0   r2  r3
+
+    Example:
+        >>> observation = torch.tensor([[0.0], [0.5], [0.9]]).numpy()
+        >>> action = torch.tensor([[0.0], [0.5], [0.4]]).numpy()  # each observation is the sum of the actions so far
+        >>> reward = torch.tensor([0.0, 1.0, 2.0]).numpy()
+        >>> forbes.Episode(observation, action, reward, terminated=True, frames=2).total_reward
+        3.0
     """
 
     observation: NDArray[Any]
@@ -127,15 +140,13 @@ class DamagedEpisodeError(ForbesError):
 
 def problem_of(episode: Episode) -> str:
     """Return what is wrong with the arrays of an episode, or an empty string."""
-    count = len(episode.observation)
-    for name, dtypes, dimensions in (
-        ("observation", ("uint8", "float32"), (2, 4)),
-        ("action", ("float32",), (2,)),
-        ("reward", ("float32",), (1,)),
-    ):
-        array: NDArray[Any] = getattr(episode, name)
-        if array.dtype not in dtypes or array.ndim not in dimensions or len(array) != count or count < 2:
-            return f"its {name} is {array.dtype} {array.shape}, expected {' or '.join(dtypes)} of at least 2 steps"
+    count = len(np.atleast_1d(episode.observation))
+    for name in _ARRAYS:
+        if not isinstance(array := getattr(episode, name), np.ndarray):
+            return f"its {name} is a {type(array).__name__}, expected an array"
+        if (array.dtype.str, array.ndim) not in _KINDS[name] or not 2 <= len(array) == count:
+            kinds = " or ".join(f"{np.dtype(dtype)} of rank {rank}" for dtype, rank in _KINDS[name])
+            return f"its {name} is {array.dtype} {array.shape}, expected {kinds}, with {count} and at least 2 steps"
         if not np.isfinite(array).all():
             return f"its {name} is not finite at step {np.argwhere(~np.isfinite(array))[0, 0]}"
     if episode.action[0].any() or episode.reward[0] != 0:
@@ -164,10 +175,41 @@ def problem_with(environment: dict[str, Any], episode: Episode) -> str:
     return ""
 
 
+def describe_episode(
+    number: int, episode: Episode, seed: int, policy: str, environment: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the fields of a record that are known before the file, as they will be read from the index.
+
+    Raises:
+        ForbesError: if the environment cannot be written as JSON.
+    """
+    try:
+        plain_environment = json.loads(json.dumps(environment, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ForbesError(
+            f"episode {number}: its environment is not JSON ({error}). Describe it by plain values"
+        ) from error
+    return {
+        "number": number,
+        "steps": len(episode.reward) - 1,
+        "frames": _plain(episode.frames),
+        "total_reward": episode.total_reward,
+        "terminated": _plain(episode.terminated),
+        "seed": _plain(seed),
+        "policy": policy,
+        "environment": plain_environment,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Return a number of NumPy as one of Python, which can be written as JSON."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def pack_episode(episode: Episode, about: dict[str, Any]) -> bytes:
     """Return the content of the file. The same episode results in the same bytes."""
     content = io.BytesIO()
-    arrays = {name: getattr(episode, name) for name in _ARRAYS}
+    arrays = {name: np.ascontiguousarray(getattr(episode, name)) for name in _ARRAYS}  # column-major cannot be mapped
     np.savez(content, allow_pickle=False, **arrays, meta=np.array(json.dumps(about)))
     return content.getvalue()
 

@@ -62,6 +62,7 @@ class Experience(SequenceSource):
         self._make = find_environment(task, **self.options)
         self._writer: EpisodeWriter | None = None
         self._replay: Replay | None = None
+        self.followed: Path | None = None  # the folder to which another process of the training writes
         self._shapes: dict[str, Any] | None = None
 
     @cached_property
@@ -104,6 +105,13 @@ class Experience(SequenceSource):
         """Open a folder for the episodes, and lock it until `close`."""
         self._writer = EpisodeWriter(folder).__enter__()
         self._refresh()
+
+    def follow(self) -> None:
+        """Sample from the episodes that another process of the training has stored in `followed` by now."""
+        if self._replay is None:
+            self._replay = Replay(str(self.followed), self.capacity, hold_out=0)
+        else:
+            self._replay.refresh()
 
     def close(self) -> None:
         """Unlock the folder and close the environment. Episodes and shapes remain accessible."""
@@ -199,7 +207,7 @@ class Experience(SequenceSource):
 
     @watermark.setter
     def watermark(self, value: int | None) -> None:
-        if value is not None:
+        if value is not None and self.followed is None:
             self._require_writer().set_aside(value)
             self._refresh()
 

@@ -14,7 +14,6 @@ episodes exist.
 """
 
 import hashlib
-import json
 import re
 import sys
 from collections.abc import Iterable, Sequence
@@ -32,6 +31,7 @@ from forbes.data.episodes.episode import (
     Episode,
     EpisodeFile,
     EpisodeRecord,
+    describe_episode,
     locate_episode,
     map_episode,
     pack_episode,
@@ -183,8 +183,21 @@ class EpisodeWriter(EpisodeStore):
     Entering repairs the traces of a kill: a truncated line of the index, a partial file, and a complete file without
     its line. An index that is lost, or ends in zeros, is rebuilt from the files, with a warning on stderr.
 
+    `append` refuses what could not be read again, and episodes of another environment than that of the earlier ones.
+
     Raises:
         ForbesError: on entering, if another process writes to the folder.
+
+    Example:
+        >>> arrays = torch.zeros(11, 2).numpy(), torch.zeros(11, 1).numpy(), torch.zeros(11).numpy()
+        >>> episode = forbes.Episode(*arrays, terminated=False, frames=10)
+        >>> environment = {"task": "mine", "observation_shape": [2], "action_dim": 1, "discrete": False}
+        >>> with forbes.EpisodeWriter("episodes/mine") as writer:
+        ...     record = writer.append(episode, seed=0, policy="human", environment=environment)
+        >>> record.number, record.steps
+        (0, 10)
+        >>> forbes.Replay("episodes/mine").size("train")
+        11
     """
 
     def __enter__(self) -> Self:
@@ -233,26 +246,22 @@ class EpisodeWriter(EpisodeStore):
             episode: complete episode, from its first to its last observation.
             seed: seed with which the environment was reset.
             policy: name of the policy.
-            environment: description from `describe_environment`: task, shapes and settings, as plain values.
+            environment: task, `observation_shape`, `action_dim`, `discrete` and any settings, as plain values; of an
+                `Environment`, the result of `describe_environment`.
 
         Raises:
             ForbesError: if the episode is invalid, is from another environment, or cannot be written.
         """
+        if problem := problem_of(episode):
+            raise self._not_stored(problem)
         number = self.watermark
-        about: dict[str, Any] = {
-            "number": number,
-            "steps": len(episode.reward) - 1,
-            "frames": episode.frames,
-            "total_reward": episode.total_reward,
-            "terminated": episode.terminated,
-            "seed": seed,
-            "policy": policy,
-            "environment": json.loads(json.dumps(environment)),
-        }
-        if problem := problem_of(episode) or problem_with(about["environment"], episode):
-            raise ForbesError(f"{self.file(number)}: not stored, {problem}. Fix the environment or the policy")
+        about = describe_episode(number, episode, seed, policy, environment)
+        if problem := problem_with(about["environment"], episode):
+            raise self._not_stored(problem)
         content = pack_episode(episode, about)
         record = EpisodeRecord(**about, size=len(content), sha256=hashlib.sha256(content).hexdigest())
+        if problem := record.problem():
+            raise self._not_stored(problem)
         if name := self.index.differs(record):
             stored = next(iter(self.records.values())).settings.get(name)
             raise ForbesError(
@@ -266,6 +275,9 @@ class EpisodeWriter(EpisodeStore):
             self.file(number).unlink(missing_ok=True)
             raise
         return record
+
+    def _not_stored(self, problem: str) -> ForbesError:
+        return ForbesError(f"{self.file(self.watermark)}: not stored, {problem}. Fix the environment or the policy")
 
     def set_aside(self, watermark: int) -> int:
         """Go back to a checkpoint: move the episodes from this number on to `set_aside/`, and return their number.

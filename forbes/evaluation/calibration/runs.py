@@ -5,7 +5,7 @@ import torch
 from forbes.errors import ForbesError
 from forbes.evaluation.calibration.self_calibration import SelfCalibration, self_calibration
 from forbes.evaluation.runs import TrainedRun
-from forbes.models import StateSpaceModel
+from forbes.models import VectorModel
 
 __all__ = ["calibrate_run"]
 
@@ -23,7 +23,7 @@ def calibrate_run(run: TrainedRun, sequences: int, time: int, samples: int, seed
     Raises:
         ForbesError: if the model has no state, the data have too few sequences or steps, or the training diverged.
     """
-    if not isinstance(run.model, StateSpaceModel):
+    if isinstance(run.model, VectorModel) or not run.model.initial(1).state.shape[-1]:
         raise ForbesError(f"{run.path}: a {run.family} model has no state that could be ranked. Name other runs")
     size = run.data.source.size("train")
     if time > run.data.length:

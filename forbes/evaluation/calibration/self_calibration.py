@@ -13,7 +13,7 @@ from torch import Tensor
 
 from forbes.evaluation.calibration.ranks import TwoSampleTest, ranks, tarp_ranks, two_sample_test
 from forbes.evaluation.scores import LogMeanExp
-from forbes.models import EncodedSequence, StateSpaceModel
+from forbes.models import BeliefModel, EncodedSequence, Filtered, PosteriorModel, has_posterior
 from forbes.seeding import derive_seed, forked, generator
 
 __all__ = ["SelfCalibration", "self_calibration"]
@@ -28,8 +28,8 @@ class SelfCalibration(NamedTuple):
 
     value: Tensor
     """Rank of each dimension of s_t, `(N, D)`."""
-    density: Tensor
-    """Rank of the belief's log-density, estimated as a mixture over posterior trajectories, `(N,)`."""
+    density: Tensor | None
+    """Rank of the belief's log-density, a mixture over posterior trajectories, `(N,)`; None if it has none."""
     tarp: Tensor
     """Rank of the distance from a random point, `(N,)`."""
     classifier: TwoSampleTest
@@ -37,7 +37,7 @@ class SelfCalibration(NamedTuple):
 
 
 @torch.no_grad()
-def self_calibration(model: StateSpaceModel, action: Tensor, samples: int, seed: int = 0) -> SelfCalibration:
+def self_calibration(model: BeliefModel, action: Tensor, samples: int, seed: int = 0) -> SelfCalibration:
     """Rank the last state of each sequence that the model imagines.
 
     Args:
@@ -52,16 +52,22 @@ def self_calibration(model: StateSpaceModel, action: Tensor, samples: int, seed:
         encoded = EncodedSequence(observation, model.embed_target(observation), action)
         truth = rollout.state[:, -1]  # (N, D)
         draws = torch.stack([model.sample_beliefs(encoded, 1).state for _ in range(samples + 1)])  # (L + 1, N, D)
-        of_truth, of_draws = LogMeanExp(), LogMeanExp()
-        for _ in range(_COMPONENTS):
-            context = model.filter(encoded.embedding, action).context[:, -1]  # (N, C)
-            of_truth.add(model.posterior.log_prob(truth, context).double())
-            of_draws.add(model.posterior.log_prob(draws[1:], context).double())
+        log_belief = _log_belief(model, encoded, torch.cat((truth[None], draws[1:]))) if has_posterior(model) else None
     draw = generator(seed, "ties", 0)
     truth, draws = truth.double().cpu(), draws.double().cpu()
     return SelfCalibration(
         value=ranks(truth, draws[1:], draw),
-        density=ranks(of_truth.result().cpu(), of_draws.result().cpu(), draw),
+        density=None if log_belief is None else ranks(log_belief[0], log_belief[1:], draw),
         tarp=tarp_ranks(truth, draws, draw),
         classifier=two_sample_test(truth, draws, generator(seed, "classifier", 0)),
     )
+
+
+def _log_belief(model: PosteriorModel, encoded: EncodedSequence, state: Tensor) -> Tensor:
+    """Estimate the log-density of the last belief of each sequence at `(L, N, D)`: nats, `(L, N)`, on the CPU."""
+    density = LogMeanExp()
+    for _ in range(_COMPONENTS):
+        filtered = model.filter(encoded.embedding, encoded.action)
+        last = Filtered(*(values[:, -1:] for values in filtered))  # (N, 1, ...)
+        density.add(model.posterior_log_prob(state[:, :, None], last)[..., 0].double())
+    return density.result().cpu()

@@ -393,11 +393,19 @@ WRONG = {
     "its observation is not finite at step 1": {"observation": broken(WHOLE.observation, 1, 1)},
     r"its reward is float32 \(5,\)": {"reward": WHOLE.reward[:-1]},
     r"its action is float64 \(6, 1\), expected float32": {"action": WHOLE.action.astype(float)},
-    r"its observation is int64 \(6, 2\), expected uint8 or float32": {"observation": WHOLE.observation.astype(int)},
+    r"its observation is int64 \(6, 2\), expected uint8 of rank 4": {"observation": WHOLE.observation.astype(int)},
     r"its observation is float32 \(1, 2\), .* at least 2 steps": {
         "observation": WHOLE.observation[:1], "action": WHOLE.action[:1], "reward": WHOLE.reward[:1]
     },
     "its first action or reward is not zero": {"reward": WHOLE.reward + 1},
+    r"its observation is uint8 \(6, 2\), expected": {"observation": WHOLE.observation.astype(np.uint8)},
+    r"its observation is float32 \(6, 2, 1, 1\), expected": {"observation": WHOLE.observation[..., None, None]},
+    r"its observation is >f4 \(6, 2\), expected": {"observation": WHOLE.observation.astype(">f4")},
+    "its action is a list, expected an array": {"action": WHOLE.action.tolist()},
+    "its observation is a float, expected an array": {"observation": 1.5},
+    "its frames is -1": {"frames": -1},
+    "its frames is 2.5": {"frames": 2.5},
+    "its terminated is None": {"terminated": None},
 }  # fmt: skip
 
 
@@ -408,6 +416,38 @@ def test_an_episode_that_is_not_whole_is_not_stored(store, sentence):
             writer.append(WHOLE._replace(**WRONG[sentence]), seed=0, policy="test", environment=ENVIRONMENT)
         assert writer.watermark == 3
     assert numbers(store) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"seed": 2**63}, "its seed is 9223372036854775808"),
+        ({"policy": 3}, "its policy is 3"),
+        ({"environment": ENVIRONMENT | {"speed": np.nan}}, "its environment is not JSON"),
+        ({"environment": ENVIRONMENT | {"speed": object()}}, "its environment is not JSON"),
+    ],
+)
+def test_a_record_that_cannot_be_read_again_is_not_written(change, sentence, store):
+    index = (store / "index.jsonl").read_bytes()
+    with EpisodeWriter(store) as writer, pytest.raises(ForbesError, match=sentence):
+        append(writer, **change)
+
+    assert (store / "index.jsonl").read_bytes() == index
+    assert numbers(store) == [0, 1, 2]
+
+
+def test_any_memory_layout_and_numbers_of_numpy_are_stored(store):
+    other = episode(3)._replace(
+        observation=np.asfortranarray(episode(3).observation),
+        reward=np.repeat(episode(3).reward, 2)[::2],
+        terminated=np.bool_(False),
+        frames=np.int64(10),
+    )
+    with EpisodeWriter(store) as writer:
+        writer.append(other, seed=np.uint32(7), policy="test", environment=ENVIRONMENT)
+
+    assert numbers(store) == [0, 1, 2, 3]
+    assert_is(steps_of(EpisodeStore(store), 3), 3)
 
 
 def test_other_environments_are_refused_but_not_other_machines(store):

@@ -1,0 +1,136 @@
+"""Export an episode store to formats of other software, without loss."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forbes.data.episodes.episode import Episode
+from forbes.data.episodes.store import EpisodeStore
+from forbes.data.imports.reader import imported
+from forbes.envs.images import CHANNELS
+from forbes.errors import ForbesError
+from forbes.files import writing
+
+__all__ = ["export_store"]
+
+_Add: TypeAlias = Callable[[int, Episode], None]
+"""Function that writes an episode, given its number in the export."""
+
+
+def export_store(store: EpisodeStore, output: Path, name: str) -> Iterator[int]:
+    """Export all episodes of a store, and yield the number of each. Importing the result gives the same arrays.
+
+    Args:
+        store: the episodes.
+        output: file or folder to write. It appears when it is complete.
+        name: format, "hdf5" (robomimic's layout), "minari" or "npz" (Dreamer's).
+
+    Raises:
+        ForbesError: if an episode is damaged, the output exists or cannot be written, or a library is missing.
+    """
+    if output.exists():
+        raise ForbesError(f"{output}: exists. Choose another name, or delete it")
+    shape = next(iter(store.records.values())).environment["observation_shape"]
+    if len(shape) == 3 and shape[0] not in CHANNELS:
+        raise ForbesError(f"{store.path}: its images have {shape[0]} channels, expected 1, 3 or 4 to export them")
+    partial = output.with_name(f"{output.name}.partial")
+    partial.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
+    with writing(output):
+        with _WRITERS[name](store, partial, output.name) as add:
+            for number, episode in enumerate(map(store.episode, store.records)):
+                add(number, episode)
+                yield number
+        partial.rename(output)
+
+
+@contextmanager
+def _npz(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
+    """Write a folder of `.npz` files as Dreamer does: index t has (o_t, a_{t-1}, r_t)."""
+    path.mkdir()
+
+    def add(number: int, episode: Episode) -> None:
+        last = np.arange(len(episode.reward)) == len(episode.reward) - 1  # (T + 1,)
+        ends = {"is_first": last[::-1], "is_last": last, "is_terminal": last & episode.terminated}
+        key, observation = _observation(episode)
+        arrays = {key: observation, "action": episode.action, "reward": episode.reward, **ends}
+        discount = (~ends["is_terminal"]).astype(np.float32)
+        np.savez_compressed(path / f"{number:06d}-{len(episode.reward)}.npz", discount=discount, **arrays)
+
+    yield add
+
+
+@contextmanager
+def _hdf5(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
+    """Write an HDF5 file in robomimic's layout: index t has (o_t, a_t, r_t), and `next_obs` the next observation."""
+    with imported("h5py", "hdf5").File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["total"] = sum(record.steps for record in store.records.values())
+        data.attrs["env_args"] = json.dumps({"env_name": _environment(store)["task"], "type": 2, "env_kwargs": {}})
+
+        def add(number: int, episode: Episode) -> None:
+            key, observation = _observation(episode)
+            demo = data.create_group(f"demo_{number}")
+            demo.attrs["num_samples"] = len(episode.reward) - 1
+            dones = np.zeros(len(episode.reward) - 1, np.uint8)
+            dones[-1] = episode.terminated
+            arrays = {f"obs/{key}": observation[:-1], f"next_obs/{key}": observation[1:], "dones": dones}
+            arrays |= {"actions": episode.action[1:], "rewards": episode.reward[1:]}
+            for name, array in arrays.items():
+                demo.create_dataset(name, data=array, compression="gzip")
+
+        yield add
+
+
+@contextmanager
+def _minari(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
+    """Write a Minari data set: T + 1 observations and T actions. Images are stored without JPEG."""
+    minari, spaces = imported("minari", "minari"), imported("gymnasium", "minari").spaces
+    storage = imported("minari.dataset.minari_storage", "minari").MinariStorage
+    buffer = imported("minari.data_collector.episode_buffer", "minari").EpisodeBuffer
+    about, (_, first) = _environment(store), _observation(store.episode(next(iter(store.records))))
+    limits = (0, 255) if first.dtype == np.uint8 else (-np.inf, np.inf)
+    actions = spaces.Discrete(about["action_dim"]) if about["discrete"] else _box(store, spaces)
+    folder = (path / "data").absolute()  # the library adds a relative path to itself
+    folder.mkdir(parents=True)
+    observations = spaces.Box(*limits, first.shape[1:], first.dtype)
+    data = storage.new(folder, observations, actions, data_format="hdf5", jpeg_encoding=False)
+    data_id = f"{re.sub(r'[^-_a-zA-Z0-9]', '_', name)}-v0"
+    data.update_metadata({"dataset_id": data_id, "minari_version": minari.__version__})
+
+    def add(number: int, episode: Episode) -> None:
+        action = episode.action[1:].argmax(1) if about["discrete"] else episode.action[1:]  # (T,) or (T, A)
+        last = np.arange(len(action)) == len(action) - 1  # (T,)
+        ends = {"terminations": last & episode.terminated, "truncations": last & (not episode.terminated)}
+        observation = _observation(episode)[1]
+        data.update_episodes([buffer(number, None, None, observation, action, episode.reward[1:], **ends)])
+
+    yield add
+
+
+_WRITERS = {"hdf5": _hdf5, "minari": _minari, "npz": _npz}
+
+
+def _environment(store: EpisodeStore) -> dict[str, Any]:
+    return next(iter(store.records.values())).environment
+
+
+def _box(store: EpisodeStore, spaces: Any) -> Any:
+    """Return the space of continuous actions: [-1, 1], or unbounded if some are beyond."""
+    bounded = all(np.abs(store.episode(number).action).max() <= 1 for number in store.records)
+    bound = 1.0 if bounded else np.inf
+    return spaces.Box(-bound, bound, (_environment(store)["action_dim"],), np.float32)
+
+
+def _observation(episode: Episode) -> tuple[str, NDArray[Any]]:
+    """Return the usual key of the observations, and their array: images with the channel last."""
+    if episode.observation.ndim == 4:
+        return "image", episode.observation.transpose(0, 2, 3, 1)  # (T + 1, H, W, C)
+    return "vector", episode.observation

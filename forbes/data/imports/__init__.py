@@ -1,0 +1,1 @@
+"""Episodes recorded by other software: a reader per format, and the import to an episode store."""

@@ -1,0 +1,259 @@
+"""Recorded episodes as episodes of our store: index t has (o_t, a_{t-1}, r_t)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forbes.data.episodes.episode import Episode, problem_of
+from forbes.data.imports.keys import choose_keys
+from forbes.data.imports.reader import Frames, Reader, Recorded
+from forbes.envs.images import to_image
+from forbes.errors import ForbesError
+from forbes.reading import readable
+
+__all__ = ["REMEDY", "SAMPLE", "Source"]
+
+REMEDY = "Repair it or leave it out, and run the same command again"
+SAMPLE = 20
+"""Number of episodes to read before an import, for ranges and to find out whether actions are one-hot."""
+_MOST = 10_000  # discrete actions; larger integers are something else
+
+
+class _Steps(NamedTuple):
+    """An episode in numbers, before it is shifted."""
+
+    observation: NDArray[Any]
+    """Every k-th one, uint8 `(n, C, H, W)` or float32 `(n, O)`."""
+    observed: int
+    """Number of observations, N."""
+    action: NDArray[Any]
+    """`(N, ...)`, or one fewer."""
+    reward: NDArray[np.float32]
+
+
+class Source:
+    r"""The episodes of a reader, converted one at a time.
+
+    A format that has (o_t, a_t, r_t) at index t, where a_t is chosen after o_t and earns r_t, is shifted::
+
+        theirs   o1  o2  o3        ours   o1  o2  o3
+                 a1  a2  a3               0   a1  a2
+                 r1  r2  r3               0   r1  r2
+
+    The last action and its reward are dropped, unless the format has the observation after them.
+
+    Args:
+        reader: the recorded episodes.
+        path: file or folder, for messages and as the name of the task.
+        image: key of the observation, if it is an image.
+        proprio: keys of the observation, if it is a vector; several are concatenated.
+        action: key of the action. Integers become one-hot.
+        reward: key of the reward. Without one, rewards are 0.
+        resize: side of the images in pixels.
+        fps: steps per second to keep. The k actions of a kept step are joined, its rewards summed.
+
+    Raises:
+        ForbesError: if there are no episodes, a key is wrong, or the first episode is damaged.
+    """
+
+    def __init__(
+        self,
+        reader: Reader,
+        path: Path,
+        image: str | None = None,
+        proprio: Sequence[str] = (),
+        action: str | None = None,
+        reward: str | None = None,
+        resize: int | None = None,
+        fps: float | None = None,
+    ) -> None:
+        self.reader, self.path, self.resize = reader, path, resize
+        self.drops_last = False
+        if len(reader) == 0:
+            raise ForbesError(f"{path}: there are no episodes. Name another file or folder")
+        with readable(path, reader.name, REMEDY):
+            self.fields = reader.fields()
+        self.keys = choose_keys(str(path), reader, self.fields, image, proprio, action, reward)
+        self.every = self._every(fps)
+        self.discrete, self.action_count = self._kind_of_actions()
+        if self.discrete and self.every > 1:
+            raise ForbesError(f"{path}: --fps {fps} would join {self.every} discrete actions. Keep all steps")
+        self.first = self.episode(0)
+
+    def __len__(self) -> int:
+        return len(self.reader)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the environment for the record of an episode: the name of the source, shapes, and the conversion."""
+        return {
+            "task": self.path.resolve().name,
+            "observation_shape": list(self.first.observation.shape[1:]),
+            "action_dim": self.first.action.shape[1],
+            "discrete": self.discrete,
+            "action_repeat": self.every,
+            "imported": {"format": self.reader.name, "resize": self.resize, "keys": self.keys.all()},
+        }
+
+    def episode(self, number: int) -> Episode:
+        """Read and convert an episode.
+
+        Raises:
+            ForbesError: if it is damaged, or its shapes are not those of the first one.
+        """
+        recorded, steps = self._load(number)
+        episode = self._align(recorded, steps)
+        problem, first = problem_of(episode), getattr(self, "first", episode)
+        for name in ("observation", "action"):
+            found, expected = (getattr(each, name).shape[1:] for each in (episode, first))
+            if not problem and found != expected:
+                problem = f"its {name} has shape {found}, expected that of the first episode, {expected}"
+        if not problem and self.discrete and not _one_hot(episode.action[1:]):
+            problem = "its actions are not one-hot, but those of the first episodes are"
+        if problem:
+            raise ForbesError(f"{recorded.where}: {problem}. {REMEDY}")
+        return episode
+
+    def _load(self, number: int) -> tuple[Recorded, _Steps]:
+        """Read an episode, and decode its images."""
+        with readable(f"{self.path}: episode {number}", self.reader.name, REMEDY):
+            recorded = self._read(number, self.keys.all())
+            action = _numbers(recorded, self.keys.action)  # (N, ...)
+            reward = np.zeros(len(action), np.float32)  # (N,)
+            if self.keys.reward is not None:
+                reward = _float32(_numbers(recorded, self.keys.reward))
+                reward = reward.reshape(len(reward), -1).sum(1)  # (N,)
+            if self.keys.image is not None:
+                observation, count = self._images(recorded, recorded.values[self.keys.image])  # (n, C, H, W)
+            else:
+                parts = [_float32(_numbers(recorded, key)) for key in self.keys.proprio]
+                count = len(parts[0])
+                if len(lengths := {len(part) for part in parts}) > 1:
+                    raise ForbesError(f"{recorded.where}: unequal lengths of {self.keys.proprio}: {lengths}. {REMEDY}")
+                observation = np.concatenate([part.reshape(count, -1) for part in parts], axis=1)  # (N, O)
+                observation = observation[:: self.every]  # (n, O)
+        return recorded, _Steps(observation, count, action, reward)
+
+    def _read(self, number: int, keys: list[str]) -> Recorded:
+        recorded = self.reader.read(number, keys)
+        for key in keys:
+            if key not in recorded.values:
+                raise ForbesError(f"{recorded.where}: has no {key}, unlike other episodes. {REMEDY}")
+        return recorded
+
+    def _images(self, recorded: Recorded, frames: Frames) -> tuple[NDArray[np.uint8], int]:
+        """Return every k-th image, `(n, C, H, W)`, and the number of all."""
+        kept, count = [], 0
+        for count, frame in enumerate(frames, start=1):
+            if frame.dtype != np.uint8:
+                raise ForbesError(f"{recorded.where}: its image has dtype {frame.dtype}, expected uint8. {REMEDY}")
+            if (count - 1) % self.every == 0:
+                kept.append(to_image(frame, self.resize))
+        return np.stack(kept), count
+
+    def _align(self, recorded: Recorded, steps: _Steps) -> Episode:
+        """Shift actions and rewards to the observation that they led to, and join those of skipped steps."""
+        reader, (observation, count, action, reward) = self.reader, steps
+        shift_allowed = 0 if reader.actions_lead or reader.rewards_lead else 1
+        if len(reward) != len(action) or not 0 <= count - len(action) <= shift_allowed:
+            raise ForbesError(
+                f"{recorded.where}: unequal lengths: {count} observations, {len(action)} actions, {len(reward)} "
+                f"rewards. {REMEDY}"
+            )
+        if reader.actions_lead and self.action_count is None and action[0].any():
+            raise ForbesError(
+                f"{recorded.where}: its first action is not zero, expected index t to have the action that led to "
+                f"o_t. {REMEDY}"
+            )
+        self.drops_last = shift_allowed == 1 and count == len(action)
+        kept = (count - 1) // self.every  # T
+        used = kept * self.every
+        action = self._vectors(recorded, (action[1:] if reader.actions_lead else action)[:used])  # (kT, A)
+        reward = (reward[1:] if reader.rewards_lead else reward)[:used]  # (kT,)
+        return Episode(
+            observation=observation,  # (T + 1, ...)
+            action=_after_zero(action.reshape(kept, self.every * action.shape[1])),  # (T + 1, kA)
+            reward=_after_zero(reward.reshape(kept, self.every).sum(1)),  # (T + 1,)
+            terminated=bool(recorded.terminated) and used == count - 1,
+            frames=used,
+        )
+
+    def _vectors(self, recorded: Recorded, action: NDArray[Any]) -> NDArray[np.float32]:
+        """Return actions as vectors, `(N, A)`."""
+        if self.action_count is None:
+            return _float32(action.reshape(len(action), -1))  # (N, A)
+        number = action.reshape(-1)  # (N,)
+        if number.size and not 0 <= number.min() <= number.max() < self.action_count:
+            raise ForbesError(
+                f"{recorded.where}: its actions are {number.min()} to {number.max()}, expected 0 to "
+                f"{self.action_count - 1}. {REMEDY}"
+            )
+        one_hot: NDArray[np.float32] = np.eye(self.action_count, dtype=np.float32)[number]
+        return one_hot  # (N, A)
+
+    def _kind_of_actions(self) -> tuple[bool, int | None]:
+        """Return whether actions are discrete, and their number if they are integers."""
+        shape, dtype = self.fields[self.keys.action]
+        if dtype.kind not in "iu" or np.prod(shape, dtype=int) != 1:
+            certain = slice(None) if self.reader.actions_lead else slice(-1)  # the last one may be no action
+            sample = [self._actions(number)[certain] for number in range(min(SAMPLE, len(self)))]
+            rows = [action for action in sample if len(action)]
+            discrete = bool(rows) and all(map(_one_hot, rows))
+            if dtype.kind in "iu" and not discrete:
+                raise ForbesError(
+                    f"{self.path}: {self.keys.action} is {dtype} {shape}, expected one integer, a one-hot vector or "
+                    "floats. Several discrete actions are not supported"
+                )
+            return discrete, None
+        if (count := self.reader.action_count) is None:
+            count = 1 + int(max(self._actions(number).max(initial=1) for number in range(len(self))))
+        if count > _MOST:
+            raise ForbesError(
+                f"{self.path}: {self.keys.action} is an integer up to {count - 1}, expected a discrete action"
+            )
+        return True, count
+
+    def _actions(self, number: int) -> NDArray[Any]:
+        """Return the actions of an episode, without the first one if it led to the first observation."""
+        with readable(f"{self.path}: episode {number}", self.reader.name, REMEDY):
+            action = _numbers(self._read(number, [self.keys.action]), self.keys.action)
+        return action[1:] if self.reader.actions_lead else action
+
+    def _every(self, fps: float | None) -> int:
+        """Return k: one of k steps is kept."""
+        if fps is None:
+            return 1
+        if self.reader.fps is None:
+            raise ForbesError(
+                f"{self.path}: --fps {fps:g} needs the rate of the data, which {self.reader.name} has not"
+            )
+        every = round(self.reader.fps / fps)
+        if every < 1 or abs(self.reader.fps / fps - every) > 0.01 * every:
+            raise ForbesError(f"{self.path}: --fps {fps:g} does not divide the {self.reader.fps:g} steps per second")
+        return every
+
+
+def _numbers(recorded: Recorded, key: str) -> NDArray[Any]:
+    array = np.asarray(recorded.values[key])
+    if array.dtype.kind not in "biuf" or not array.ndim:
+        raise ForbesError(f"{recorded.where}: {key} is {array.dtype} {array.shape}, expected numbers. {REMEDY}")
+    return array
+
+
+def _float32(values: NDArray[Any]) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):  # the result is infinite, and refused
+        converted: NDArray[np.float32] = values.astype(np.float32)
+    return converted
+
+
+def _after_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Prepend a zero: nothing led to the first observation."""
+    return np.concatenate([np.zeros_like(values[:1], shape=(1, *values.shape[1:])), values])  # (T + 1, ...)
+
+
+def _one_hot(action: NDArray[Any]) -> bool:
+    """Return whether all rows are one-hot, `(N, A)` with A > 1."""
+    pairs = action.ndim == 2 and action.shape[1] > 1 and len(action)
+    return bool(pairs and np.isin(action, (0, 1)).all() and (action.sum(1) == 1).all())

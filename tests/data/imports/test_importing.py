@@ -1,0 +1,251 @@
+"""An import ends with a whole store or with none, after a kill too, and needs the memory of one episode."""
+
+import multiprocessing
+import os
+import signal
+import tracemalloc
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import recordings
+
+from forbes.choices import EXPORTS
+from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
+from forbes.data.exports import export_store
+from forbes.data.imports.formats import open_reader
+from forbes.data.imports.importing import import_episodes, is_imported, partial_path
+from forbes.data.imports.source import SAMPLE, Source
+from forbes.data.imports.survey import survey
+from forbes.errors import ForbesError
+
+
+def source(path, **options):
+    return Source(open_reader(path), path, **options)
+
+
+def imported(path, output, **options):
+    return list(import_episodes(source(path, **options), output))
+
+
+def content(store):
+    """The files of a store, but for the process in its lock."""
+    return {path.name: path.read_bytes() for path in store.rglob("*") if path.is_file() and path.name != ".lock"}
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """A folder of six episodes."""
+    return recordings.write("dreamer", tmp_path / "recorded", recordings.episodes(6))
+
+
+def test_an_imported_episode_says_where_it_is_from(recorded, tmp_path):
+    records = imported(recorded, tmp_path / "store")
+
+    assert [record.steps for record in records] == [4, 5, 6, 7, 8, 9]
+    assert records[0].environment == {
+        "task": "recorded",
+        "observation_shape": [2],
+        "action_dim": 1,
+        "discrete": False,
+        "action_repeat": 1,
+        "imported": {"format": "dreamer", "resize": None, "keys": ["state", "action", "reward"]},
+    }
+    assert list(EpisodeStore(tmp_path / "store").records) == [0, 1, 2, 3, 4, 5]
+    assert not partial_path(tmp_path / "store").exists()
+    assert is_imported(source(recorded), tmp_path / "store")
+
+
+def import_and_die(recorded, output, when):
+    """Import, and be killed at the n-th time that something is synced to the disk."""
+    calls, sync = [], os.fsync
+
+    def fsync(descriptor):
+        calls.append(1)
+        if len(calls) == when:
+            os.kill(os.getpid(), signal.SIGKILL)
+        sync(descriptor)
+
+    os.fsync = fsync
+    imported(recorded, output)
+
+
+@pytest.mark.parametrize("when", [1, 2, 3, 4, 7, 9, 10, 19, 20, 21, 22])  # files, folders, index; at last the new name
+def test_a_killed_import_continues_to_the_same_bytes(when, recorded, tmp_path):
+    imported(recorded, tmp_path / "whole")
+    store = tmp_path / "store"
+    process = multiprocessing.get_context("fork").Process(target=import_and_die, args=(recorded, store, when))
+    process.start()
+    process.join()
+
+    assert process.exitcode == -signal.SIGKILL
+    assert store.exists() == (when == 22)
+    if not store.exists():
+        imported(recorded, store)
+    assert is_imported(source(recorded), store)
+    assert content(store) == content(tmp_path / "whole")
+
+
+def test_an_import_does_not_continue_another_one(recorded, tmp_path):
+    (tmp_path / "others").mkdir()
+    other = recordings.write("dreamer", tmp_path / "others" / "recorded", recordings.episodes(6, seed=1))
+    begun = import_episodes(source(recorded), tmp_path / "store")
+    next(begun)
+    begun.close()
+
+    with pytest.raises(ForbesError, match=r"store\.partial: has episodes that are not those of .*others"):
+        imported(other, tmp_path / "store")
+    with pytest.raises(ForbesError, match=r"store\.partial: has episodes that are not those"):
+        imported(recorded, tmp_path / "store", reward="action")
+
+
+def test_a_folder_with_anything_else_is_left_alone(recorded, tmp_path):
+    (tmp_path / "notes").mkdir()
+    imported(recorded, tmp_path / "store")
+
+    with pytest.raises(ForbesError, match=r"notes: exists and is not a store of"):
+        is_imported(source(recorded), tmp_path / "notes")
+    with pytest.raises(ForbesError, match=r"store: exists and is not a store of"):
+        is_imported(source(recorded, reward="action"), tmp_path / "store")
+    assert not is_imported(source(recorded), tmp_path / "new")
+
+
+def test_memory_is_that_of_an_episode(tmp_path):
+    recorded, size = tmp_path / "recorded", 0
+    recorded.mkdir()
+    for number in range(40):
+        image = np.random.default_rng(number).integers(0, 256, (30, 64, 64, 3), np.uint8)
+        np.savez(recorded / f"{number:02d}.npz", image=image, action=np.zeros((30, 1), np.float32))
+        size = image.nbytes
+    tracemalloc.start()
+    imported(recorded, tmp_path / "store")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert peak < 8 * size < 40 * size  # the array, its images, their copy, and the file of it
+
+
+@pytest.mark.parametrize("images", [False, True], ids=["vectors", "images"])
+@pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
+@pytest.mark.parametrize("name", EXPORTS)
+def test_an_exported_store_is_imported_bit_for_bit(name, discrete, images, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a relative path, as one types it
+    exported = Path("exported")
+    pytest.importorskip({"hdf5": "h5py", "minari": "minari"}.get(name, "numpy"))
+    random = np.random.default_rng(0)
+    about = {"task": "toy", "action_dim": 3, "discrete": discrete}
+    with EpisodeWriter(tmp_path / "store") as writer:
+        for episode in recordings.episodes(4, images=images):
+            steps = len(episode.reward) - 1
+            action = np.eye(3)[random.integers(3, size=steps)] if discrete else random.uniform(-1, 1, (steps, 3))
+            action = np.concatenate([np.zeros((1, 3)), action]).astype(np.float32)
+            observation = episode.observation
+            if images:
+                observation = random.integers(0, 256, observation.shape, np.uint8)
+            about["observation_shape"] = list(observation.shape[1:])
+            writer.append(episode._replace(observation=observation, action=action), 0, "test", about)
+        writer.quarantine(1)
+    store = EpisodeStore(tmp_path / "store")
+
+    assert list(export_store(store, exported, name)) == [0, 1, 2]
+    found = source(exported)
+
+    assert (found.discrete, len(found)) == (discrete, 3)
+    for number, ours in zip(store.records, map(found.episode, range(3)), strict=True):
+        theirs = store.episode(number)
+        for one, other in zip(ours[:3], theirs[:3], strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+        assert ours.terminated == theirs.terminated
+    with pytest.raises(ForbesError, match="exported: exists"):
+        next(export_store(store, exported, name))
+
+
+def test_integers_become_one_hot_actions(tmp_path):
+    (tmp_path / "recorded").mkdir()
+    for number in range(3):
+        arrays = {"state": np.ones((4, 2)), "action": np.array([0, number, 1, 0])}
+        np.savez(tmp_path / "recorded" / f"{number}.npz", **arrays)
+    found = source(tmp_path / "recorded")
+
+    assert found.discrete
+    np.testing.assert_array_equal(found.episode(2).action, [[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0]])
+    assert not found.episode(2).reward.any()
+
+
+def test_an_episode_of_one_step_leaves_actions_one_hot(tmp_path):
+    (tmp_path / "recorded").mkdir()
+    for steps in (1, 3):
+        action = np.concatenate([np.zeros((1, 2)), np.eye(2)[[0, 1, 0][:steps]]])
+        np.savez(tmp_path / "recorded" / f"{steps}.npz", state=np.ones(steps + 1), action=action)
+
+    assert source(tmp_path / "recorded").discrete
+
+
+def test_actions_that_stop_being_one_hot_are_refused(tmp_path):
+    (tmp_path / "recorded").mkdir()
+    for number in range(SAMPLE + 1):
+        action = np.array([[0, 0], [1, 0], [0, 1 if number < SAMPLE else 2]])
+        np.savez(tmp_path / "recorded" / f"{number:02d}.npz", state=np.ones(3), action=action)
+
+    with pytest.raises(ForbesError, match=r"20\.npz: its actions are not one-hot, but those of the first episodes are"):
+        imported(tmp_path / "recorded", tmp_path / "store")
+
+
+def test_parts_of_a_minari_data_set_are_chosen_by_key(tmp_path, monkeypatch):
+    minari, spaces = pytest.importorskip("minari"), pytest.importorskip("gymnasium").spaces
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    image = np.random.default_rng(0).integers(0, 256, (4, 8, 8, 3), np.uint8)
+    parts = {"camera": image, "robot": {"place": np.arange(8.0).reshape(4, 2), "gripper": np.arange(4)}}
+    vectors = {"place": spaces.Box(-9, 9, (2,)), "gripper": spaces.Discrete(4)}
+    observations = spaces.Dict({"camera": spaces.Box(0, 255, (8, 8, 3), np.uint8), "robot": spaces.Dict(vectors)})
+    episode = EpisodeBuffer(
+        0, None, None, parts, np.array([5, 7, 6]), [1.0, 2.0, 3.0], [False] * 3, [False] * 2 + [True]
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that nobody is named as author
+        minari.create_dataset_from_buffers(
+            "lab/toy-v0", [episode], action_space=spaces.Discrete(4, start=5), observation_space=observations
+        )
+
+    with pytest.raises(ForbesError, match="choose --image camera or --proprio robot/gripper or --proprio robot/place"):
+        source(tmp_path / "lab/toy-v0")
+    vector = source(tmp_path / "lab/toy-v0", proprio=["robot/place", "robot/gripper"]).episode(0)
+    np.testing.assert_array_equal(vector.observation, [[0, 1, 0], [2, 3, 1], [4, 5, 2], [6, 7, 3]])
+    np.testing.assert_array_equal(vector.action[1:], np.eye(4)[[0, 2, 1]])
+    by_id = Source(open_reader(Path("lab/toy-v0"), "minari"), Path("lab/toy-v0"), image="camera")
+    np.testing.assert_array_equal(by_id.episode(0).observation, image.transpose(0, 3, 1, 2))
+    assert by_id.describe()["task"] == "toy-v0"
+
+
+def test_a_lower_rate_joins_actions_and_sums_rewards(tmp_path):
+    theirs = recordings.episodes(4)
+    path = recordings.write("lerobot", tmp_path / "recorded", theirs)
+    ours = source(path, proprio=["observation.state"], fps=recordings.FPS / 2).episode(3)  # of 7 steps
+
+    np.testing.assert_array_equal(ours.observation, theirs[3].observation[:7:2])
+    np.testing.assert_array_equal(ours.action[1:], theirs[3].action[1:7].reshape(3, 2))
+    np.testing.assert_array_equal(ours.reward[1:], theirs[3].reward[1:7].reshape(3, 2).sum(1))
+    assert (ours.frames, ours.terminated) == (6, False)
+    with pytest.raises(ForbesError, match="--fps 4 does not divide the 10 steps per second"):
+        source(path, proprio=["observation.state"], fps=4)
+    with pytest.raises(ForbesError, match="--fps 4 needs the rate of the data"):
+        source(recordings.write("dreamer", tmp_path / "dreamer", theirs), fps=4)
+
+
+def test_the_table_says_what_becomes_of_each_key(tmp_path):
+    path = recordings.write("lerobot", tmp_path / "recorded", recordings.episodes(3))
+    found = survey(source(path, proprio=["observation.state"]))
+
+    rows = {row[0]: row[1:] for row in found.rows}
+    assert rows["observation.state"][:3] == ("observation", "(2,)", "float32")
+    assert rows["action"][0] == "action"
+    assert rows["next.reward"][0] == "reward"
+    assert rows["timestamp"] == ("not used", "()", "float32", "")
+    low, high = map(float, rows["action"][3].split(" to "))
+    assert -1 <= low < high <= 1
+    assert "shifted by one" in found.facts["alignment"]
+    assert found.facts["episodes"] == "3, of 4 to 6 steps, 0 terminated"
