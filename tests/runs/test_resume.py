@@ -131,6 +131,8 @@ MIDDLE, BEFORE_LAST, LAST_OF_EPOCH, LAST = 6, 8, 9, 19
         (signal.SIGTERM, BEFORE_LAST, 10),  # not between the epoch's last update and its validation
         (signal.SIGTERM, LAST_OF_EPOCH, 10),
         (signal.SIGTERM, LAST, 20),
+        (signal.SIGUSR1, MIDDLE, 8),  # SLURM: before the end of the time, or a preemption
+        (signal.SIGUSR2, MIDDLE, 8),
     ],
 )
 def test_a_signal_stops_a_training_where_it_can_go_on(
@@ -187,6 +189,22 @@ def test_a_signal_does_not_part_the_batches_of_an_update(tiny_config, tmp_path, 
     assert main(["fit", "--resume", run]) == 0
 
     assert_same_run(run, straight)
+
+
+def test_signals_of_a_cluster_around_one_sigterm_lose_no_update(tiny_config, tmp_path, monkeypatch):
+    """As SLURM sends them at a preemption, and a launcher passes them on."""
+
+    def preempt(self, loss):
+        if self.global_step == MIDDLE:
+            for number in (signal.SIGTERM, signal.SIGUSR2, signal.SIGUSR1, signal.SIGUSR1):
+                os.kill(os.getpid(), number)
+
+    run = RunFolder(tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(WorldModel, "on_before_backward", preempt)
+        assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run)]) == 128 + signal.SIGTERM
+
+    assert read_checkpoint(run.checkpoint)["global_step"] == 8
 
 
 def test_a_second_signal_stops_at_once(tiny_config, tmp_path, monkeypatch):
