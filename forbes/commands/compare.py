@@ -10,9 +10,10 @@ from rich.markdown import Markdown
 
 from forbes.commands.console import console
 from forbes.commands.evaluate import evaluate, wanted_metrics
-from forbes.commands.jobs import run_jobs
+from forbes.commands.jobs import Launcher, run_jobs
+from forbes.commands.launchers.local import Local
 from forbes.commands.parsers.compare import parser
-from forbes.commands.trainings import Training, training_job
+from forbes.commands.trainings import Training, failures, training_job
 from forbes.errors import ForbesError
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record
@@ -39,7 +40,7 @@ def main(argv: Sequence[str]) -> None:
         for config, of_config in zip(args.configs, folders.values(), strict=True)
         for seed, run in of_config.items()
     ]
-    _train(trainings, args.jobs)
+    _train(trainings, Local(args.jobs))
     loaded = load_runs([of_config[0] for of_config in folders.values()])
     wanted = wanted_metrics(loaded, args)
     families = [
@@ -68,12 +69,14 @@ def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, 
     return {name: {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)} for name in names}
 
 
-def _train(trainings: Sequence[Training], at_once: int) -> None:
+def _train(trainings: Sequence[Training], launcher: Launcher) -> None:
     """Run all trainings to the end. Finished runs return at once."""
-    statuses = run_jobs([training_job(training) for training in trainings], at_once)
-    if failed := {run: status for run, status in statuses.items() if status != 0}:
-        ends = ", ".join(f"{run} with status {status}" for run, status in failed.items())
-        raise ForbesError(f"trainings that failed: {ends}. Fix the errors above, then repeat the command")
+    ended = run_jobs([training_job(training) for training in trainings], launcher)
+    if failed := failures(ended):
+        raise ForbesError(
+            f"{len(failed)} of {len(ended)} trainings are not finished, for the reasons above: {', '.join(failed)}. "
+            "Fix them, then repeat the command"
+        )
 
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:
