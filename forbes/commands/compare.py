@@ -11,9 +11,10 @@ from rich.markdown import Markdown
 from forbes.commands.console import console
 from forbes.commands.evaluate import evaluate, wanted_metrics
 from forbes.commands.jobs import Launcher, run_jobs
-from forbes.commands.launchers.local import Local
-from forbes.commands.parsers.compare import parser
-from forbes.commands.trainings import Training, failures, training_job
+from forbes.commands.launchers import open_launcher
+from forbes.commands.parsers.compare import parser, require_sweep
+from forbes.commands.sweep import sweep
+from forbes.commands.trainings import Training, failures, not_finished, training_job
 from forbes.errors import ForbesError
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record
@@ -34,13 +35,18 @@ def main(argv: Sequence[str]) -> None:
     cut = argv.index("--") if "--" in argv else len(argv)
     args, flags = parser().parse_args(argv[:cut]), list(argv[cut + 1 :])
     command = command_line("compare", *argv)
+    launcher = open_launcher(args, args.output, args.jobs or 1)
+    if args.sweep:
+        require_sweep(args)
+        find_config(args.configs[0])
+        return sweep(args.configs[0], args.sweep, flags, args.seeds, args.output, launcher)
     folders = _run_folders(args.configs, args.seeds, args.output)
     trainings = [
         Training(config, tuple(flags), seed, run)
         for config, of_config in zip(args.configs, folders.values(), strict=True)
         for seed, run in of_config.items()
     ]
-    _train(trainings, Local(args.jobs))
+    _train(trainings, launcher)
     loaded = load_runs([of_config[0] for of_config in folders.values()])
     wanted = wanted_metrics(loaded, args)
     families = [
@@ -73,10 +79,7 @@ def _train(trainings: Sequence[Training], launcher: Launcher) -> None:
     """Run all trainings to the end. Finished runs return at once."""
     ended = run_jobs([training_job(training) for training in trainings], launcher)
     if failed := failures(ended):
-        raise ForbesError(
-            f"{len(failed)} of {len(ended)} trainings are not finished, for the reasons above: {', '.join(failed)}. "
-            "Fix them, then repeat the command"
-        )
+        raise not_finished(failed, len(ended))
 
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:

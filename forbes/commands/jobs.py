@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from signal import SIGTERM, signal
 from types import FrameType
 from typing import NamedTuple, NoReturn, Protocol
@@ -14,7 +14,7 @@ from forbes.commands.board import Board
 from forbes.runs.folder import RunFolder
 from forbes.runs.stop import STOPPED
 
-__all__ = ["ATTEMPTS", "Ended", "Job", "Launcher", "run_jobs"]
+__all__ = ["ATTEMPTS", "Ended", "Job", "Launcher", "checkpoint_time", "run_jobs"]
 
 ATTEMPTS = 3
 """A job is given up when it has crashed so many times in a row without a new checkpoint."""
@@ -74,8 +74,8 @@ class Launcher(Protocol):
     at_once: int
     """Number of jobs that are waited for at the same time."""
 
-    def begin(self, jobs: Sequence[Job]) -> None:
-        """Prepare for these jobs, before the first attempt."""
+    def ready(self, jobs: Sequence[Job]) -> AbstractContextManager[object]:
+        """Return a context in which these jobs can be attempted."""
 
     def attempt(self, job: Job, say: Callable[[str], None]) -> int:
         """Start or resume a job, wait for its end, and return its exit status.
@@ -110,11 +110,14 @@ def run_jobs(
     """
     board = Board({job.name: job.hours for job in jobs}, later)
     allowed = [job for job in jobs if not job.refused]
-    with _sigterm_raises(), board.shown(), ThreadPoolExecutor(max(launcher.at_once, 1)) as pool:
+    with (
+        _sigterm_raises(),
+        launcher.ready(allowed) if allowed else nullcontext(),
+        board.shown(),
+        ThreadPoolExecutor(launcher.at_once) as pool,
+    ):
         running = _Running(board, launcher, on_end)
         try:
-            if allowed:
-                launcher.begin(allowed)
             found = [pool.submit(running.run, job) for job in jobs]
             return [ended.result() for ended in found]
         except BaseException:
@@ -146,9 +149,9 @@ class _Running:
         """Repeat a job that crashes; return its last exit status and the number of attempts without progress."""
         attempts = 0
         while True:
-            before = _checkpoint_time(job)
+            before = checkpoint_time(job)
             status = self.launcher.attempt(job, lambda line: self.board.say(job.name, line))
-            attempts = attempts + 1 if _checkpoint_time(job) == before else 1
+            attempts = attempts + 1 if checkpoint_time(job) == before else 1
             if status in _FINAL or attempts == ATTEMPTS or self.stopping.is_set():
                 return status, attempts
             self.board.note(f"{job.name}: ended with status {status}, begins again (attempt {attempts + 1})")
@@ -159,7 +162,7 @@ class _Running:
         self.launcher.stop()
 
 
-def _checkpoint_time(job: Job) -> int:
+def checkpoint_time(job: Job) -> int:
     """Return when the checkpoint of a job was written, in ns; 0 if there is none."""
     checkpoint = RunFolder(job.run).checkpoint if job.run else None
     return checkpoint.stat().st_mtime_ns if checkpoint is not None and checkpoint.exists() else 0

@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +15,8 @@ from forbes.runs.configuration import allowed_modules
 from forbes.runs.folder import RunFolder, read_config
 from forbes.runs.provenance import read_provenance
 
-__all__ = ["Training", "failures", "forbes_command", "is_finished", "training_job"]
+__all__ = ["Training", "failures", "forbes_command", "is_finished", "not_finished", "require_trainable"]
+__all__ += ["training_job"]
 
 _SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed")  # the first is linked to the others
 
@@ -68,6 +69,24 @@ def failures(ended: Sequence[Ended]) -> dict[str, str]:
     for name, reason in reasons.items():
         print(f"not finished: {name} {reason}", flush=True)
     return reasons
+
+
+def not_finished(failed: Mapping[str, str], total: int) -> ForbesError:
+    """Return the error for trainings whose reasons have been printed."""
+    names = ", ".join(failed)
+    return ForbesError(
+        f"{len(failed)} of {total} trainings are not finished, for the reasons above: {names}. "
+        "Fix them, then repeat the command"
+    )
+
+
+def require_trainable(config: str, flags: Sequence[str]) -> None:
+    """Check the keys and values of a configuration.
+
+    Raises:
+        ForbesError: the error of `forbes fit`.
+    """
+    _configuration(config, *flags)
 
 
 def forbes_command(*arguments: str) -> list[str]:

@@ -1,7 +1,5 @@
 """`forbes compare`: trains, measures and puts side by side; interrupted, it goes on."""
 
-import contextlib
-import io
 import json
 import os
 import platform
@@ -11,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from jobs_in_this_process import configuration_here, run_here
 
 from forbes.commands import compare as compare_command
 from forbes.commands import trainings
@@ -28,26 +27,12 @@ ONE_EPOCH = ["--", "--trainer.max_epochs", "1"]
 MEASURES = ["--samples", "2", "--particles", "2", "--futures", "2", "--context", "2"]
 
 
-def in_this_process(jobs, launcher):
-    return [Ended(job, (job.refused and 2) or in_process(job.current()), 0.0, "its last line") for job in jobs]
-
-
-def in_process(command):
-    return main(command[command.index("forbes") + 1 :])
-
-
-def configuration_in_this_process(config, *flags):
-    with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit, match="0"):
-        main(["fit", "--config", config, *flags, "--print_config"])
-    return printed.getvalue()
-
-
 @pytest.fixture(scope="module", autouse=True)
 def one_process():
     """A process of its own would spend most of a test on its imports."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compare_command, "run_jobs", in_this_process)
-        patch.setattr(trainings, "_configuration", configuration_in_this_process)
+        patch.setattr(compare_command, "run_jobs", run_here)
+        patch.setattr(trainings, "_configuration", configuration_here)
         yield
 
 
@@ -206,11 +191,11 @@ def test_it_goes_on_where_it_was_stopped(configs, tmp_path, monkeypatch):
     measure = compare_command.evaluate
 
     def killed_in_the_second(jobs, launcher):
-        return [*in_this_process(jobs[:1], launcher), Ended(jobs[1], 143, 0.0, "stopped at update 0")]
+        return [*run_here(jobs[:1], launcher), Ended(jobs[1], 143, 0.0, "stopped at update 0")]
 
     monkeypatch.setattr(compare_command, "run_jobs", killed_in_the_second)
     assert main(command) == 2
-    monkeypatch.setattr(compare_command, "run_jobs", in_this_process)
+    monkeypatch.setattr(compare_command, "run_jobs", run_here)
     monkeypatch.setattr(compare_command, "evaluate", lambda runs, *rest: measure(runs[:1], *rest) and 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(command)

@@ -10,28 +10,17 @@ import numpy as np
 import pytest
 import yaml
 from command_line import error_of
+from jobs_in_this_process import run_here
 
 from forbes.commands import budgets, reproduce, score_tables
 from forbes.commands.budgets import Family, Size
 from forbes.commands.cli import main
-from forbes.commands.jobs import Ended
 from forbes.commands.parsers.reproduce import BUDGETS, PARTS
 from forbes.commands.report import write_report
 from forbes.evaluation.claims import CLAIMS
 from forbes.evaluation.record import read_record
 from forbes.runs.configs import find_config
 from forbes.runs.folder import read_metrics
-
-
-def in_this_process(jobs, launcher, later=0.0, on_end=lambda ended: None):
-    """A process of its own would spend most of a test on its imports."""
-    found = []
-    for job in jobs:
-        command = job.current()
-        status = 2 if job.refused else main(list(command[command.index("forbes") + 1 :]))
-        found.append(Ended(job, status, 0.01, "its last <line>"))
-        on_end(found[-1])
-    return found
 
 
 @pytest.fixture
@@ -47,7 +36,7 @@ def tiny_plan(tiny_config, tmp_path, monkeypatch):
     monkeypatch.setattr(budgets, "_PARTS", nothing | {"strokes": lambda: plan})
     monkeypatch.setitem(budgets._SMOKE_FLAGS, "strokes", ())
     monkeypatch.setattr(budgets, "_FIGURES", ())
-    monkeypatch.setattr(reproduce, "run_jobs", in_this_process)
+    monkeypatch.setattr(reproduce, "run_jobs", run_here)
     return plan
 
 
@@ -121,12 +110,12 @@ def test_interrupted_it_resumes_where_it_stopped(tiny_plan, tmp_path, monkeypatc
 
     def killed_in_the_second(jobs, launcher, later=0.0, on_end=None):
         begun.append([job.name for job in jobs])
-        in_this_process(jobs[:1], launcher)
+        run_here(jobs[:1], launcher)
         raise KeyboardInterrupt
 
     def counted(jobs, launcher, *others):
         begun.append([job.name for job in jobs])
-        return in_this_process(jobs, launcher, *others)
+        return run_here(jobs, launcher, *others)
 
     monkeypatch.setattr(reproduce, "_run_steps", lambda steps, *others: {})
     monkeypatch.setattr(reproduce, "run_jobs", killed_in_the_second)
@@ -143,7 +132,7 @@ def test_a_step_is_repeated_only_if_a_run_was_trained_further(tiny_plan, tmp_pat
 
     def counted(jobs, launcher, *others):
         ran.extend(job.name for job in jobs)
-        return in_this_process(jobs, launcher, *others)
+        return run_here(jobs, launcher, *others)
 
     assert main(smoke(tmp_path)) == 0
     monkeypatch.setattr(reproduce, "run_jobs", counted)

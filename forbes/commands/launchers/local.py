@@ -5,6 +5,7 @@ import signal
 import subprocess
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 from forbes.commands.jobs import Job
 from forbes.commands.launchers.process import end, follow, start
@@ -25,8 +26,9 @@ class Local:
         self._lock, self._stopping = threading.Lock(), False
         self._processes: list[subprocess.Popen[str]] = []
 
-    def begin(self, jobs: Sequence[Job]) -> None:
-        """Do nothing: a process is started when there is room for it."""
+    def ready(self, jobs: Sequence[Job]) -> AbstractContextManager[object]:
+        """Return an empty context."""
+        return nullcontext()
 
     def attempt(self, job: Job, say: Callable[[str], None]) -> int:
         """Run a job as a process, and return its exit status."""

@@ -16,22 +16,21 @@ _PATIENCE = ((signal.SIGTERM, 20.0), (signal.SIGTERM, 5.0), (signal.SIGKILL, 4.0
 """Signals to end a process, and the seconds to wait after each; the second SIGTERM loses an agent's epoch."""
 
 
-def start(
-    command: Sequence[str], threads: int, folder: str | Path | None = None, piped: bool = True
-) -> subprocess.Popen[str]:
+def start(command: Sequence[str], threads: int, folder: str | Path | None = None) -> subprocess.Popen[str]:
     """Start a process that gets no signal from the terminal and exits when this process does.
+
+    Its output, stdout and stderr together, goes to a pipe.
 
     Args:
         command: arguments of the Python interpreter.
         threads: CPU threads of the process, unless OMP_NUM_THREADS is set.
         folder: working directory; by default that of this process.
-        piped: whether its output, stdout and stderr together, goes to a pipe.
     """
     return subprocess.Popen(
         [sys.executable, *command],
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE if piped else None,
-        stderr=subprocess.STDOUT if piped else None,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
         cwd=folder,
