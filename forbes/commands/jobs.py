@@ -12,7 +12,7 @@ from typing import NamedTuple, NoReturn, Protocol
 
 from forbes.commands.board import Board
 from forbes.runs.folder import RunFolder
-from forbes.runs.stop import STOPPED
+from forbes.runs.signals import STOPPED
 
 __all__ = ["ATTEMPTS", "Ended", "Job", "Launcher", "checkpoint_time", "run_jobs"]
 

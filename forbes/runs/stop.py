@@ -11,13 +11,9 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from forbes.data import Experience
 from forbes.data.datamodule import datamodule_of
 from forbes.runs.folder import RunFolder
+from forbes.runs.signals import ANNOUNCED, OF_A_USER
 
-__all__ = ["STOPPED", "StopOnSignal"]
-
-_OF_A_USER = (signal.SIGINT, signal.SIGTERM)
-_ANNOUNCED = (signal.SIGUSR1, signal.SIGUSR2)  # by a cluster, before it takes the machine away
-STOPPED = frozenset(status for number in (*_OF_A_USER, *_ANNOUNCED) for status in (128 + number, -number))
-"""Exit statuses of a training that a signal ended; negative ones if it came before the training began."""
+__all__ = ["StopOnSignal"]
 
 
 class StopOnSignal(Callback):
@@ -52,7 +48,7 @@ class StopOnSignal(Callback):
         """Replace Lightning's signal handlers, which Lightning restores after the training."""
         self._end_loop = signal.getsignal(signal.SIGTERM)
         self._whole_epochs = isinstance(datamodule_of(trainer).source, Experience)
-        for number in (*_OF_A_USER, *_ANNOUNCED):
+        for number in (*OF_A_USER, *ANNOUNCED):
             signal.signal(number, self._receive)
         if trainer.received_sigterm:  # before this point; Lightning would end the loop within an agent's epoch
             cast(Any, trainer)._signal_connector.received_sigterm = False
@@ -74,7 +70,7 @@ class StopOnSignal(Callback):
             trainer.save_checkpoint(self.run.checkpoint)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        if number in _OF_A_USER:
+        if number in OF_A_USER:
             if self._asked:
                 raise SystemExit(128 + number)
             self._asked = True

@@ -4,9 +4,8 @@ import os
 import shutil
 import signal
 
-import pandas as pd
 import pytest
-import torch
+from continued_runs import assert_same_run
 
 from forbes.commands.cli import main
 from forbes.runs.checkpoint import ResumeWholeEpochs, read_checkpoint
@@ -22,14 +21,6 @@ def straight(tiny_config, tmp_path_factory):
     run = tmp_path_factory.mktemp("runs") / "straight"
     assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run), *FOUR_EPOCHS]) == 0
     return run
-
-
-def assert_same_run(one, other):
-    pd.testing.assert_frame_equal(read_metrics(one), read_metrics(other), check_exact=True)
-    state, expected = (read_checkpoint(RunFolder(run).checkpoint) for run in (one, other))
-    assert state["global_step"] == expected["global_step"]
-    for part in ("state_dict", "optimizer_states"):
-        torch.testing.assert_close(state[part], expected[part], rtol=0, atol=0)
 
 
 def test_two_epochs_and_two_more_are_four_epochs(straight, tiny_run, tmp_path):
