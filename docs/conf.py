@@ -31,7 +31,7 @@ extensions = [
 
 root_doc = "docs/index"
 include_patterns = ["docs/**", "notebooks/**", "*.md", "*/README.md", "data/pretrained/README.md"]
-include_patterns += ["benchmarks/gpu.md", "benchmarks/growth.md"]
+include_patterns += ["benchmarks/gpu.md", "benchmarks/growth.md", "benchmarks/scale.md"]
 exclude_patterns = ["README.md", "docs/site", "docs/results/runs", "build", "runs", "tests", ".*", "**/.*"]
 
 default_role = "py:obj"  # a docstring's `name` is code, and a link where it is documented

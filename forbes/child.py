@@ -1,4 +1,4 @@
-"""Child processes that end with their parent and ignore SIGINT and SIGTERM.
+"""Child processes that end with their parent: spawned ones, which ignore SIGINT and SIGTERM, and `python -m forbes`.
 
 Nothing heavy is imported here, since a new process imports this module first.
 """
@@ -8,6 +8,7 @@ import os
 import pickle
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
@@ -15,8 +16,10 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-__all__ = ["start_child"]
+__all__ = ["PARENT", "exit_with_parent", "start_child"]
 
+PARENT = "FORBES_PARENT"
+"""Environment variable with the process that a new process `python -m forbes` has to follow."""
 _LEFT_TO_PARENT = (signal.SIGINT, signal.SIGTERM)  # signals to the process group, which the parent handles
 
 
@@ -69,4 +72,19 @@ def _follow_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
+    os._exit(1)
+
+
+def exit_with_parent() -> None:
+    """Let this process exit at most a second after the process that the environment variable `PARENT` names, if set.
+
+    Otherwise the training of a killed launcher would keep its run folder locked.
+    """
+    if parent := os.environ.pop(PARENT, None):
+        threading.Thread(target=_exit_after, args=(int(parent),), daemon=True).start()
+
+
+def _exit_after(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1)
     os._exit(1)

@@ -10,9 +10,11 @@ from rich.markdown import Markdown
 
 from forbes.commands.console import console
 from forbes.commands.evaluate import evaluate, wanted_metrics
-from forbes.commands.jobs import run_jobs
-from forbes.commands.parsers.compare import parser
-from forbes.commands.trainings import Training, training_job
+from forbes.commands.jobs import Launcher, run_jobs
+from forbes.commands.launchers import open_launcher
+from forbes.commands.parsers.compare import parser, require_sweep
+from forbes.commands.sweep import sweep
+from forbes.commands.trainings import Training, failures, not_finished, training_job
 from forbes.errors import ForbesError
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record, require_readable, results_folders
@@ -33,13 +35,18 @@ def main(argv: Sequence[str]) -> None:
     cut = argv.index("--") if "--" in argv else len(argv)
     args, flags = parser().parse_args(argv[:cut]), list(argv[cut + 1 :])
     command = command_line("compare", *argv)
+    launcher = open_launcher(args, args.output, args.jobs or 1)
+    if args.sweep:
+        require_sweep(args)
+        find_config(args.configs[0])
+        return sweep(args.configs[0], args.sweep, flags, args.seeds, args.output, launcher)
     folders = _run_folders(args.configs, args.seeds, args.output)
     trainings = [
         Training(config, tuple(flags), seed, run)
         for config, of_config in zip(args.configs, folders.values(), strict=True)
         for seed, run in of_config.items()
     ]
-    _train(trainings, args.jobs)
+    _train(trainings, launcher)
     loaded = load_runs([of_config[0] for of_config in folders.values()])
     wanted = wanted_metrics(loaded, args)
     families = [
@@ -70,12 +77,11 @@ def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, 
     return {name: {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)} for name in names}
 
 
-def _train(trainings: Sequence[Training], at_once: int) -> None:
+def _train(trainings: Sequence[Training], launcher: Launcher) -> None:
     """Run all trainings to the end. Finished runs return at once."""
-    statuses = run_jobs([training_job(training) for training in trainings], at_once)
-    if failed := {run: status for run, status in statuses.items() if status != 0}:
-        ends = ", ".join(f"{run} with status {status}" for run, status in failed.items())
-        raise ForbesError(f"trainings that failed: {ends}. Fix the errors above, then repeat the command")
+    ended = run_jobs([training_job(training) for training in trainings], launcher)
+    if failed := failures(ended):
+        raise not_finished(failed, len(ended))
 
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:

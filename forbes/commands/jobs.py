@@ -1,35 +1,48 @@
-"""Run commands in parallel, each in its own process with an equal share of the CPU threads."""
+"""Run a list of jobs with a launcher, repeat those that crashed, and say how each one ended."""
 
-import os
-import re
-import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from datetime import timedelta
+from signal import SIGTERM, signal
 from types import FrameType
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn, Protocol
 
-from rich.console import Group
-from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
+from forbes.commands.board import Board
+from forbes.runs.folder import RunFolder
+from forbes.runs.signals import STOPPED
 
-__all__ = ["Ended", "Job", "run_jobs"]
+__all__ = ["ATTEMPTS", "Ended", "Job", "Launcher", "checkpoint_time", "run_jobs"]
+
+ATTEMPTS = 3
+"""A job is given up when it has crashed so many times in a row without a new checkpoint."""
+_FINAL = {
+    0,
+    2,
+    3,
+} | STOPPED  # finished, an error that the user can fix, a divergence, a signal: a repeat changes nothing
 
 
 class Job(NamedTuple):
-    """One command."""
+    """One command. The launcher decides where it runs."""
 
     name: str
     command: Sequence[str]
+    """Arguments of the Python interpreter."""
     hours: float = 1.0
     """How long it takes, relative to the other jobs, for the time that is left."""
+    run: str = ""
+    """Run folder of a training, whose checkpoint the job resumes from; empty for other commands."""
+    resume: Sequence[str] = ()
+    """The command if the run has a checkpoint."""
+    refused: str = ""
+    """Why it must not be run, if so."""
+
+    def current(self) -> Sequence[str]:
+        """Return the command that starts the job, or resumes it from the checkpoint that the run has now."""
+        return self.resume if self.run and RunFolder(self.run).checkpoint.exists() else self.command
 
 
 class Ended(NamedTuple):
@@ -37,147 +50,133 @@ class Ended(NamedTuple):
 
     job: Job
     status: int
-    """Exit status."""
+    """Exit status of the last attempt."""
     hours: float
-    """How long it took."""
+    """How long all attempts took."""
     last: str
-    """Its last line."""
+    """Last line of its output."""
+    attempts: int = 1
+    """Number of attempts since the last new checkpoint."""
+
+    @property
+    def reason(self) -> str:
+        """Return why the job is not finished."""
+        if self.status in STOPPED:
+            return "was interrupted"
+        times = f" {self.attempts} times" if self.attempts > 1 else ""
+        refused = self.job.refused.removeprefix(f"{self.job.name}: ")
+        return refused or f"ended{times} with status {self.status}: {self.last}"
+
+
+class Launcher(Protocol):
+    """Where jobs run: processes of this machine, or of a cluster."""
+
+    at_once: int
+    """Number of jobs that are waited for at the same time."""
+
+    def ready(self, jobs: Sequence[Job]) -> AbstractContextManager[object]:
+        """Return a context in which these jobs can be attempted."""
+
+    def attempt(self, job: Job, say: Callable[[str], None]) -> int:
+        """Start or resume a job, wait for its end, and return its exit status.
+
+        It is called in a thread per job.
+
+        Args:
+            job: job to run.
+            say: function that shows a line of its output.
+        """
+
+    def stop(self) -> None:
+        """End all running jobs within 30 seconds. It is called once, and no attempt follows."""
 
 
 def run_jobs(
-    jobs: Sequence[Job], at_once: int, later: float = 0.0, on_end: Callable[[Ended], None] = lambda ended: None
-) -> dict[str, int]:
-    """Run every command, `at_once` at a time, and return the exit statuses by name.
+    jobs: Sequence[Job], launcher: Launcher, later: float = 0.0, on_end: Callable[[Ended], None] = lambda ended: None
+) -> list[Ended]:
+    """Run every job, and return how each one ended.
 
     A terminal shows a progress bar and the last line of each running job, and the time left for all; elsewhere all
-    lines are printed, prefixed with the job's name. A job that fails does not stop the others. On Ctrl-C or SIGTERM,
-    each running job gets one SIGTERM and is waited for, and no further job is started.
+    lines are printed, prefixed with the job's name. A job that fails does not stop the others. One that crashes, or
+    whose machine is lost, is begun again from its checkpoint, until it has crashed `ATTEMPTS` times in a row without a
+    new one. Errors that the user must fix (status 2) and divergences (status 3) are not repeated. On Ctrl-C or SIGTERM
+    all jobs are stopped within 30 seconds, and no further job is started.
 
     Args:
-        jobs: commands, with different names.
-        at_once: number of processes.
+        jobs: jobs with different names.
+        launcher: where they run.
         later: hours of the work that follows these jobs, counted in the time left.
         on_end: function called when a job ends, in any thread.
     """
-    board = _Board(jobs, later)
-    with _sigterm_raises(), board.shown(), ThreadPoolExecutor(at_once) as pool:
-        running = _Running(board, max(1, (os.cpu_count() or 1) // at_once), on_end)
+    board = Board({job.name: job.hours for job in jobs}, later)
+    allowed = [job for job in jobs if not job.refused]
+    with (
+        _sigterm_raises(),
+        launcher.ready(allowed) if allowed else nullcontext(),
+        board.shown(),
+        ThreadPoolExecutor(launcher.at_once) as pool,
+    ):
+        running = _Running(board, launcher, on_end)
         try:
-            found = [(job.name, pool.submit(running.run, job)) for job in jobs]
-            return {name: status.result() for name, status in found}
+            found = [pool.submit(running.run, job) for job in jobs]
+            return [ended.result() for ended in found]
         except BaseException:
             running.stop()
             raise  # after the pool has waited for the running jobs
 
 
-class _Board:
-    """Progress and last line of every running job, and the time left for all of them."""
-
-    def __init__(self, jobs: Sequence[Job], later: float) -> None:
-        self._jobs, self._later = {job.name: job for job in jobs}, later
-        self._lines: dict[str, str] = {}  # of the running jobs
-        self._fractions: dict[str, float] = {}  # done, of each job that has started
-        self._ended = 0
-        self._began = time.monotonic()
-        self._lock = threading.Lock()
-
-    def shown(self) -> AbstractContextManager[object]:
-        """Return a context that shows the jobs on the terminal, if there is one."""
-        self._live = Live(get_renderable=self._render, refresh_per_second=2) if sys.stdout.isatty() else None
-        return self._live or nullcontext()
-
-    def say(self, name: str, line: str) -> None:
-        """Show a line of a job; "17/20" in it is its progress."""
-        with self._lock:
-            self._lines[name] = line
-            if match := re.search(r"\b(\d+)/(\d+)\b", line):
-                done, total = map(int, match.groups())
-                self._fractions[name] = min(done / max(total, 1), 1.0)
-            if self._live is None:
-                print(f"{name}: {line}", flush=True)
-
-    def end(self, name: str, status: int) -> None:
-        """Print the exit status of a job with its last line, and the time left."""
-        with self._lock:
-            last = self._lines.pop(name, "")
-            self._fractions[name] = 1.0
-            self._ended += 1
-            text = f"{name}: {'done' if status == 0 else f'ended with status {status}'}. {last}"
-            if self._live is None:
-                print(text, self._all_jobs(), sep="\n", flush=True)
-            else:
-                self._live.console.print(Text(text))
-
-    def _all_jobs(self) -> str:
-        """Return how many jobs have ended, and the time left at the pace so far."""
-        done = sum(self._jobs[name].hours * fraction for name, fraction in self._fractions.items())
-        left = sum(job.hours for job in self._jobs.values()) - done + self._later
-        pace = (time.monotonic() - self._began) / done if done else 0.0
-        about = f", about {timedelta(seconds=round(pace * left))} left" if done and left > 1e-9 else ""
-        return f"{self._ended} of {len(self._jobs)} jobs have ended{about}"
-
-    def _render(self) -> Group:
-        with self._lock:
-            running = Table.grid(padding=(0, 1))
-            for name, line in self._lines.items():
-                done = ProgressBar(1.0, self._fractions.get(name, 0.0), width=20)
-                running.add_row(Text(name), done, Text(line, no_wrap=True, overflow="ellipsis"))
-            return Group(running, Text(self._all_jobs()))
-
-
 class _Running:
-    """The processes of the jobs."""
+    """The attempts of the jobs."""
 
-    def __init__(self, board: _Board, threads: int, on_end: Callable[[Ended], None]) -> None:
-        self.board, self.on_end, self.stopping, self.lock = board, on_end, False, threading.Lock()
-        self.processes: list[subprocess.Popen[str]] = []
-        self.environment = {"OMP_NUM_THREADS": str(threads)} | os.environ
+    def __init__(self, board: Board, launcher: Launcher, on_end: Callable[[Ended], None]) -> None:
+        self.board, self.launcher, self.on_end, self.stopping = board, launcher, on_end, threading.Event()
 
-    def run(self, job: Job) -> int:
-        """Run a job to its end and return its exit status."""
-        with self.lock:
-            if self.stopping:
-                return 128 + signal.SIGTERM
-            process = subprocess.Popen(
-                job.command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
-                env=self.environment,
-                start_new_session=True,  # Ctrl-C reaches only this process, so that each job gets one signal
-            )
-            self.processes.append(process)
-        began, last = time.monotonic(), ""
-        with process:
-            self.board.say(job.name, "starts")
-            for line in process.stdout or ():
-                if line.strip():
-                    last = line.strip()
-                    self.board.say(job.name, last)
-        self.board.end(job.name, process.returncode)
-        self.on_end(Ended(job, process.returncode, (time.monotonic() - began) / 3600, last))
-        return process.returncode
+    def run(self, job: Job) -> Ended:
+        """Run a job to its end."""
+        if self.stopping.is_set():
+            return Ended(job, -SIGTERM, 0.0, "")
+        began, status, attempts = time.monotonic(), 2, 0
+        if job.refused:
+            self.board.say(job.name, job.refused)
+        else:
+            status, attempts = self._attempts(job)
+        last = self.board.end(job.name, status)
+        ended = Ended(job, status, (time.monotonic() - began) / 3600, last, attempts)
+        self.on_end(ended)
+        return ended
+
+    def _attempts(self, job: Job) -> tuple[int, int]:
+        """Repeat a job that crashes; return its last exit status and the number of attempts without progress."""
+        attempts = 0
+        while True:
+            before = checkpoint_time(job)
+            status = self.launcher.attempt(job, lambda line: self.board.say(job.name, line))
+            attempts = attempts + 1 if checkpoint_time(job) == before else 1
+            if status in _FINAL or attempts == ATTEMPTS or self.stopping.is_set():
+                return status, attempts
+            self.board.note(f"{job.name}: ended with status {status}, begins again (attempt {attempts + 1})")
 
     def stop(self) -> None:
-        """Send SIGTERM to every running job, and start no further job."""
-        with self.lock:
-            self.stopping = True
-            for process in self.processes:
-                if process.poll() is None:
-                    process.terminate()
+        """Stop the running jobs, and start no further job."""
+        self.stopping.set()
+        self.launcher.stop()
+
+
+def checkpoint_time(job: Job) -> int:
+    """Return when the checkpoint of a job was written, in ns; 0 if there is none."""
+    checkpoint = RunFolder(job.run).checkpoint if job.run else None
+    return checkpoint.stat().st_mtime_ns if checkpoint is not None and checkpoint.exists() else 0
 
 
 @contextmanager
 def _sigterm_raises() -> Iterator[None]:
     """Turn SIGTERM into an exception in the main thread, the only one that may set handlers."""
-    before = signal.signal(signal.SIGTERM, _exit)
+    before = signal(SIGTERM, _exit)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal(SIGTERM, before)
 
 
 def _exit(number: int, frame: FrameType | None) -> NoReturn:
-    raise SystemExit(128 + number)
+    sys.exit(128 + number)

@@ -79,11 +79,11 @@ def write_report(
         planned: trainings of all parts of the budget, whether or not they have been run.
         budget: name of the budget.
         folder: output folder of `forbes reproduce`.
-        failed: last line of each job that failed.
+        failed: why each job that failed is not finished.
         command: command line, for the page.
     """
-    finished = [one for one in planned if is_finished(one.training.folder)]
-    runs = [_run(number, one) for number, one in enumerate(planned, start=1)]
+    finished = [one for one in planned if is_finished(one.training.folder) and one.training.folder not in failed]
+    runs = [_run(number, one, failed) for number, one in enumerate(planned, start=1)]
     steps = [*measures(finished, budget, folder), *figures(finished, folder)]
     measured = [_measure(number, step, folder) for number, step in enumerate(steps, start=1)]
     rows = [*(_claim(claim, finished, runs, measured, folder) for claim in CLAIMS), _theorem()]
@@ -109,7 +109,7 @@ def write_report(
     return rows
 
 
-def _run(number: int, one: Planned) -> Run:
+def _run(number: int, one: Planned, failed: Mapping[str, str]) -> Run:
     """Describe a training, from what its folder has recorded."""
     run = RunFolder(one.training.folder)
     entries = read_provenance(run.provenance) if run.provenance.is_file() else []
@@ -121,7 +121,7 @@ def _run(number: int, one: Planned) -> Run:
         one.family.name,
         one.family.measure,
         one.training.seed,
-        "missing" if not entries else _state(status),
+        failed.get(one.training.folder) or ("missing" if not entries else _state(status)),
         0 if metrics is None or metrics.empty else int(metrics.index.max()),
         sum(entry.get("hours", 0.0) for entry in entries),
         ", ".join(dict.fromkeys(_short(entry.get("commit")) for entry in entries)),

@@ -12,10 +12,12 @@ from rich.table import Table
 
 from forbes.commands.budgets import Planned, Step, collections, figures, measures, trainings
 from forbes.commands.console import console
-from forbes.commands.jobs import Ended, Job, run_jobs
+from forbes.commands.jobs import Ended, Job, Launcher, run_jobs
+from forbes.commands.launchers import open_launcher
+from forbes.commands.launchers.local import Local
 from forbes.commands.parsers.reproduce import PARTS, parser
 from forbes.commands.report import PAGE, Row, write_report
-from forbes.commands.trainings import forbes_command, is_finished, training_job
+from forbes.commands.trainings import failures, forbes_command, is_finished, training_job
 from forbes.errors import ForbesError
 from forbes.files import locked, replace_file
 from forbes.reading import read_json
@@ -34,6 +36,7 @@ def main(argv: Sequence[str]) -> None:
     folder = args.output or Path("runs/reproduce") / args.budget
     gpu = torch.cuda.is_available()
     at_once = args.jobs or (1 if gpu else min(os.cpu_count() or 1, 4))
+    launcher = open_launcher(args, folder, at_once)
     planned = [one for part in args.only for one in trainings(part, args.budget, folder)]
     _require_budget(folder, args.budget)
     hours = {one.training.folder: one.hours(_measured_rate(one, planned), gpu) for one in planned}
@@ -44,7 +47,9 @@ def main(argv: Sequence[str]) -> None:
     later = sum(step.hours for step in [*measures(planned, args.budget, folder), *figures(planned, folder)])
     print(
         f"{len(missing)} of {len(planned)} trainings are missing and take about {total:.1f} hours, measurements and "
-        f"figures {later:.1f}: {(total + later) / at_once:.1f} hours with --jobs {at_once}",
+        f"figures {later:.1f}"
+        + f": {(total + later) / at_once:.1f} hours with --jobs {at_once}"
+        * (args.launcher == "local"),
         flush=True,
     )
     if args.dry_run:
@@ -53,7 +58,7 @@ def main(argv: Sequence[str]) -> None:
         _ask()
     with locked(folder, "reproduces here. Wait for it, or choose another folder, -o"):
         replace_file(folder / "reproduce.json", json.dumps({"budget": args.budget}).encode() + b"\n")
-        failed = _work(planned, missing, hours, args.budget, folder, at_once)
+        failed = _work(planned, missing, hours, args.budget, folder, at_once, launcher)
         every = [one for part in PARTS for one in trainings(part, args.budget, folder)]
         rows = write_report(every, args.budget, folder, failed, command_line("reproduce", *argv))
     _print_rows(rows, args.budget)
@@ -122,17 +127,16 @@ def _work(
     budget: str,
     folder: Path,
     at_once: int,
+    launcher: Launcher,
 ) -> dict[str, str]:
-    """Train, measure and draw what is missing, and return the last line of each job that failed."""
+    """Train, measure and draw what is missing, and return why each other job is not finished."""
     jobs = {one.training.folder: training_job(one.training, hours[one.training.folder]) for one in planned}
+    planned = [one for one in planned if not jobs[one.training.folder].refused]
     later = sum(step.hours for step in [*measures(planned, budget, folder), *figures(planned, folder)])
     failed = _run_steps(collections(missing, folder), folder, at_once, 0.0)
-
-    def end(ended: Ended) -> None:
-        if ended.status != 0:
-            failed[ended.job.name] = ended.last
-
-    run_jobs([jobs[one.training.folder] for one in missing], at_once, later, end)
+    waiting = {one.training.folder for one in missing}
+    todo = [job for name, job in jobs.items() if name in waiting or job.refused]
+    failed |= failures(run_jobs(todo, launcher, later))
     finished = [one for one in planned if is_finished(one.training.folder)]
     drawings = figures(finished, folder)
     failed |= _run_steps(measures(finished, budget, folder), folder, at_once, sum(step.hours for step in drawings))
@@ -140,23 +144,20 @@ def _work(
 
 
 def _run_steps(steps: Sequence[Step], folder: Path, at_once: int, later: float) -> dict[str, str]:
-    """Run the steps that are not done yet, and return the last line of each that failed.
+    """Run the steps that are not done yet, and return why each other one is not finished.
 
     What a step has read is recorded beside the runs, so that it is repeated if a run is trained further.
     """
     records = {step.name: _record(step) for step in steps}
     missing = [step for step in steps if not _is_done(folder, step.name, records[step.name])]
-    failed: dict[str, str] = {}
 
     def end(ended: Ended) -> None:
-        if ended.status != 0:
-            failed[ended.job.name] = ended.last
         about = {"hours": round(ended.hours, 4), "exit_status": ended.status, "last": ended.last, "commit": commit()}
         content = json.dumps(records[ended.job.name] | about, indent=2)
         replace_file(folder / "steps" / f"{ended.job.name}.json", f"{content}\n".encode())
 
-    run_jobs([Job(step.name, forbes_command(*step.arguments), step.hours) for step in missing], at_once, later, end)
-    return failed
+    jobs = [Job(step.name, forbes_command(*step.arguments), step.hours) for step in missing]
+    return failures(run_jobs(jobs, Local(at_once), later, end))
 
 
 def _record(step: Step) -> dict[str, Any]:

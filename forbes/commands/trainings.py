@@ -2,19 +2,21 @@
 
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 
-from forbes.commands.jobs import Job
+from forbes.commands.jobs import Ended, Job
 from forbes.errors import ForbesError
 from forbes.runs.configuration import allowed_modules
 from forbes.runs.folder import RunFolder, read_config
 from forbes.runs.provenance import read_provenance
 
-__all__ = ["Training", "forbes_command", "is_finished", "training_job"]
+__all__ = ["Training", "failures", "forbes_command", "is_finished", "not_finished", "require_trainable"]
+__all__ += ["training_job"]
 
 _SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed")  # the first is linked to the others
 
@@ -34,19 +36,22 @@ class Training(NamedTuple):
 def training_job(training: Training, hours: float = 1.0) -> Job:
     """Return the `forbes fit` that starts a training, or resumes it from its checkpoint.
 
+    It is refused if the folder has a run of another configuration.
+
     Args:
         training: training to run to its end.
         hours: how long it takes, relative to the other jobs.
-
-    Raises:
-        ForbesError: if the folder has a run of another configuration.
     """
-    if RunFolder(training.folder).checkpoint.exists():
-        _require_same_configuration(training)
-        return Job(training.folder, forbes_command("fit", "--resume", training.folder), hours)
     config, flags, seed, folder = training
+    refused = ""
+    if RunFolder(folder).checkpoint.exists():
+        try:
+            _require_same_configuration(training)
+        except ForbesError as error:
+            refused = str(error)
     arguments = ["--config", config, *flags, "--seed_everything", str(seed), "--run_dir", folder]
-    return Job(folder, forbes_command("fit", *arguments), hours)
+    resume = forbes_command("fit", "--resume", folder)
+    return Job(folder, forbes_command("fit", *arguments), hours, folder, resume, refused)
 
 
 def is_finished(folder: str) -> bool:
@@ -58,9 +63,35 @@ def is_finished(folder: str) -> bool:
     return bool(entries) and entries[-1].get("exit_status") == 0
 
 
+def failures(ended: Sequence[Ended]) -> dict[str, str]:
+    """Print a line for each job that is not finished, and return the reasons by name."""
+    reasons = {one.job.name: one.reason for one in ended if one.status != 0}
+    for name, reason in reasons.items():
+        print(f"not finished: {name} {reason}", flush=True)
+    return reasons
+
+
+def not_finished(failed: Mapping[str, str], total: int) -> ForbesError:
+    """Return the error for trainings whose reasons have been printed."""
+    names = ", ".join(failed)
+    return ForbesError(
+        f"{len(failed)} of {total} trainings are not finished, for the reasons above: {names}. "
+        "Fix them, then repeat the command"
+    )
+
+
+def require_trainable(config: str, flags: Sequence[str]) -> None:
+    """Check the keys and values of a configuration.
+
+    Raises:
+        ForbesError: the error of `forbes fit`.
+    """
+    _configuration(config, *flags)
+
+
 def forbes_command(*arguments: str) -> list[str]:
-    """Return the command of a `forbes ...` in its own process, so that one does not affect another."""
-    return [sys.executable, "-m", "forbes", *allowed_modules(), *arguments]
+    """Return a `forbes ...` in its own process, so that one does not affect another: arguments of Python."""
+    return ["-m", "forbes", *allowed_modules(), *arguments]
 
 
 def _require_same_configuration(training: Training) -> None:
@@ -92,7 +123,8 @@ def _flat(section: Any, name: str = "") -> dict[str, Any]:
 def _configuration(config: str, *flags: str) -> str:
     """Return the complete configuration that `forbes fit` would train with, as YAML."""
     command = forbes_command("fit", "--config", config, *flags, "--print_config")
-    asked = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    asked = subprocess.run([sys.executable, *command], capture_output=True, text=True, check=False)
     if asked.returncode != 0:
-        raise ForbesError(f"{config}: `forbes fit` cannot train with it, see the error above. Fix it")
+        *_, last = asked.stderr.splitlines() or [f"{config}: `forbes fit` ended with status {asked.returncode}"]
+        raise ForbesError(last.removeprefix("forbes: "))
     return asked.stdout

@@ -1,4 +1,4 @@
-"""A clean stop: on Ctrl-C and SIGTERM a training ends with a checkpoint from which it can resume."""
+"""A clean stop: on a signal a training ends with a checkpoint from which it can resume."""
 
 import os
 import signal
@@ -13,12 +13,16 @@ from forbes.data.datamodule import datamodule_of
 from forbes.distributed import greatest
 from forbes.runs.folder import RunFolder
 from forbes.runs.launched import is_first
+from forbes.runs.signals import ANNOUNCED, OF_A_USER
 
 __all__ = ["StopOnSignal"]
 
 
 class StopOnSignal(Callback):
-    """Stops a training at the first SIGINT or SIGTERM as soon as its state is consistent, at the second immediately.
+    """Stops a training at a signal as soon as its state is consistent, at the second SIGINT or SIGTERM immediately.
+
+    SIGUSR1 and SIGUSR2 are sent by SLURM and others before the time is over or a job is preempted. They may come in
+    any number, next to one SIGTERM, and never stop a training immediately.
 
     The state is consistent after the current update. For an agent it is consistent after the epoch, since the episode
     at the start of the epoch would be missing otherwise.
@@ -32,10 +36,11 @@ class StopOnSignal(Callback):
     def __init__(self, run: RunFolder) -> None:
         self.run = run
         self.received: int | None = None
+        self._asked = False  # by SIGINT or SIGTERM
 
     @property
     def exit_status(self) -> int:
-        """Exit status of a process ended by a signal: 130 for Ctrl-C, 143 for SIGTERM.
+        """Exit status of a process ended by a signal: 130 for Ctrl-C, 143 for SIGTERM, 138 and 140 for SIGUSR1 and 2.
 
         A signal before the start of the training is received by Lightning, which handles SIGTERM only.
         """
@@ -44,7 +49,7 @@ class StopOnSignal(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Replace Lightning's signal handlers, which Lightning restores after the training."""
         self._whole_epochs = isinstance(datamodule_of(trainer).source, Experience)
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (*OF_A_USER, *ANNOUNCED):
             signal.signal(number, self._receive)
         if trainer.received_sigterm:  # before this point; Lightning would end the loop within an agent's epoch
             cast(Any, trainer)._signal_connector.received_sigterm = False
@@ -66,8 +71,12 @@ class StopOnSignal(Callback):
             trainer.save_checkpoint(self.run.checkpoint)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
+        if number in OF_A_USER:
+            if self._asked:
+                raise SystemExit(128 + number)
+            self._asked = True
         if self.received is not None:
-            raise SystemExit(128 + number)
+            return
         self.received = number
         if self._whole_epochs and is_first():  # may take minutes
             # `os.write`, since the signal may have interrupted a print

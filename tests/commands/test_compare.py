@@ -1,44 +1,38 @@
 """`forbes compare`: trains, measures and puts side by side; interrupted, it goes on."""
 
-import contextlib
-import io
 import json
+import os
+import platform
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from jobs_in_this_process import configuration_here, run_here
 
 from forbes.commands import compare as compare_command
 from forbes.commands import trainings
 from forbes.commands.cli import main
+from forbes.commands.jobs import Ended, run_jobs
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.metrics import score_of
 from forbes.evaluation.record import read_arrays, read_record
 from forbes.figures.comparison import draw_differences, draw_per_step, draw_scores
+from forbes.files import locked
+from forbes.runs.folder import read_metrics
 
 ELBO = "test/elbo[bernoulli,S=2]"
 ONE_EPOCH = ["--", "--trainer.max_epochs", "1"]
 MEASURES = ["--samples", "2", "--particles", "2", "--futures", "2", "--context", "2"]
 
 
-def in_this_process(jobs, at_once):
-    return {job.name: main(job.command[job.command.index("fit") :]) for job in jobs}
-
-
-def configuration_in_this_process(config, *flags):
-    with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit, match="0"):
-        main(["fit", "--config", config, *flags, "--print_config"])
-    return printed.getvalue()
-
-
 @pytest.fixture(scope="module", autouse=True)
 def one_process():
     """A process of its own would spend most of a test on its imports."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compare_command, "run_jobs", in_this_process)
-        patch.setattr(trainings, "_configuration", configuration_in_this_process)
+        patch.setattr(compare_command, "run_jobs", run_here)
+        patch.setattr(trainings, "_configuration", configuration_here)
         yield
 
 
@@ -196,12 +190,12 @@ def test_it_goes_on_where_it_was_stopped(configs, tmp_path, monkeypatch):
     command = ["compare", *configs, "--scores", "elbo", "-o", str(tmp_path), *MEASURES, *ONE_EPOCH]
     measure = compare_command.evaluate
 
-    def killed_in_the_second(jobs, at_once):
-        return in_this_process(jobs[:1], at_once) | {jobs[1].name: 143}
+    def killed_in_the_second(jobs, launcher):
+        return [*run_here(jobs[:1], launcher), Ended(jobs[1], 143, 0.0, "stopped at update 0")]
 
     monkeypatch.setattr(compare_command, "run_jobs", killed_in_the_second)
     assert main(command) == 2
-    monkeypatch.setattr(compare_command, "run_jobs", in_this_process)
+    monkeypatch.setattr(compare_command, "run_jobs", run_here)
     monkeypatch.setattr(compare_command, "evaluate", lambda runs, *rest: measure(runs[:1], *rest) and 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(command)
@@ -273,12 +267,27 @@ def test_references_stand_below_the_table_and_in_the_picture(compared, families)
     assert [text.get_text() for text in axes.texts if "near" in text.get_text() or "far" in text.get_text()] == []
 
 
-def test_a_run_that_was_trained_otherwise_is_refused(configs, compared, capsys):
+def test_a_run_that_was_trained_otherwise_is_refused_and_the_others_finish(configs, compared, tmp_path, capsys):
+    folder = shutil.copytree(compared / "rssm-0", tmp_path / "rssm-0").parent
 
-    assert main(["compare", *configs, "-o", str(compared), *MEASURES]) == 2
+    assert main(["compare", *configs, "-o", str(folder), *MEASURES]) == 2
 
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert "rssm-0: was trained with trainer.max_epochs = 1, expected 2. Use its configuration" in error
+    out, error = capsys.readouterr()
+    reason = "was trained with trainer.max_epochs = 1, expected 2. Use its configuration"
+    assert f"not finished: {folder}/rssm-0 {reason}" in out
+    assert f"1 of 2 trainings are not finished, for the reasons above: {folder}/rssm-0. Fix them" in error
+    assert read_metrics(folder / "forbes-0").index.max() == 10
+
+
+def test_a_folder_that_another_process_holds_is_named_with_it(configs, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(compare_command, "run_jobs", run_jobs)
+    with locked(tmp_path / "rssm-0", "trains here"):
+        assert main(["compare", *configs, "-o", str(tmp_path), *MEASURES, *ONE_EPOCH]) == 2
+
+    out = capsys.readouterr().out
+    holder = f"process {os.getpid()} on {platform.node()} trains here. Choose another --run_dir"
+    assert f"not finished: {tmp_path}/rssm-0 ended with status 2: forbes: {tmp_path}/rssm-0: {holder}" in out
+    assert read_metrics(tmp_path / "forbes-0").index.max() == 5
 
 
 def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_path, capsys):
@@ -292,7 +301,6 @@ def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_
     twin.write_text(Path(configs[0]).read_text())
     assert "another configuration is called rssm" in error_of(configs[0], str(twin))
     failed = error_of(configs[0], "--", "--model.no_such_key", "1")
-    assert "trainings that failed: " in failed
-    assert "rssm-0 with status 2" in failed
+    assert "1 of 1 trainings are not finished" in failed
     with pytest.raises(Exception, match=r"rssm-0: evaluation.json has no test/bleu"):
         compare(families, ["test/bleu"])

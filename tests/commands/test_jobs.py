@@ -1,5 +1,6 @@
 """Jobs side by side: all end, each says how, and a signal reaches every one once."""
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -8,17 +9,25 @@ import time
 
 import pytest
 
-from forbes.commands.jobs import Job, _Board, run_jobs
+from forbes.commands.board import Board
+from forbes.commands.cli import main
+from forbes.commands.jobs import Job, run_jobs
+from forbes.commands.launchers import process
+from forbes.commands.launchers.local import Local
 
 
-def python(name, code):
-    return Job(name, [sys.executable, "-c", code])
+def python(name, code, *arguments, **options):
+    return Job(name, ["-c", code, *map(str, arguments)], **options)
+
+
+def statuses(ended):
+    return {one.job.name: one.status for one in ended}
 
 
 def test_every_job_runs_and_a_failure_stops_no_other(capsys):
     jobs = [python("good", "print('fine')"), python("bad", "raise SystemExit(3)"), python("last", "print('too')")]
 
-    assert run_jobs(jobs, 2) == {"good": 0, "bad": 3, "last": 0}
+    assert statuses(run_jobs(jobs, Local(2))) == {"good": 0, "bad": 3, "last": 0}
 
     lines = capsys.readouterr().out.splitlines()
     assert "good: fine" in lines
@@ -38,23 +47,23 @@ for _ in range(1000 if {long} else 20):
         break
     time.sleep(0.01)
 else:
-    raise SystemExit(4)
+    raise SystemExit(3)
 time.sleep(0.2)
 (mine.parent / (mine.name + ".ended")).touch()
 """.replace("{long}", str(at_once == 2))
     a, b = str(tmp_path / "a"), str(tmp_path / "b")
-    jobs = [Job("a", [sys.executable, "-c", code, a, b]), Job("b", [sys.executable, "-c", code, b, a])]
+    jobs = [python("a", code, a, b), python("b", code, b, a)]
 
-    statuses = run_jobs(jobs, at_once)
+    ended = run_jobs(jobs, Local(at_once))
 
-    assert statuses["a"] == (0 if at_once == 2 else 4)
+    assert statuses(ended)["a"] == (0 if at_once == 2 else 3)
 
 
 def test_the_threads_are_shared_out(capsys, monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
 
-    run_jobs([python("one", "import os; print(os.environ['OMP_NUM_THREADS'])")], 3)
+    run_jobs([python("one", "import os; print(os.environ['OMP_NUM_THREADS'])")], Local(3))
 
     assert "one: 2" in capsys.readouterr().out.splitlines()
 
@@ -75,7 +84,8 @@ pathlib.Path(sys.argv[1]).write_text(str(len(seen)))
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would begin by ignoring it
 from forbes.commands.jobs import Job, run_jobs
-run_jobs([Job(name, [sys.executable, "-c", sys.argv[1], sys.argv[2] + name]) for name in "abc"], 2)
+from forbes.commands.launchers.local import Local
+run_jobs([Job(name, ["-c", sys.argv[1], sys.argv[2] + name]) for name in "abc"], Local(2))
 """
     arguments = [sys.executable, "-c", parent, job, str(tmp_path / "job-")]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
@@ -94,7 +104,7 @@ run_jobs([Job(name, [sys.executable, "-c", sys.argv[1], sys.argv[2] + name]) for
 def test_the_time_left_is_the_work_left_at_the_pace_so_far(monkeypatch, capsys):
     clock = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    board = _Board([Job("a", [], 1.0), Job("b", [], 1.0), Job("c", [], 2.0)], later=1.0)
+    board = Board({"a": 1.0, "b": 1.0, "c": 2.0}, later=1.0)
     board.shown()
     board.say("b", "epoch 5/10  update 50/100")
     clock[0] = 10.0
@@ -108,7 +118,99 @@ def test_the_time_left_is_the_work_left_at_the_pace_so_far(monkeypatch, capsys):
 def test_a_job_tells_how_it_ended_and_what_it_said_last():
     ended = []
 
-    run_jobs([python("bad", "print('first'); print('why'); raise SystemExit(3)")], 1, on_end=ended.append)
+    run_jobs([python("bad", "print('first'); print('why'); raise SystemExit(3)")], Local(1), on_end=ended.append)
 
     assert [(one.job.name, one.status, one.last) for one in ended] == [("bad", 3, "why")]
+    assert ended[0].reason == "ended with status 3: why"
     assert ended[0].hours > 0
+
+
+def test_a_job_that_crashes_three_times_is_given_up(tmp_path, capsys):
+    crash = "import sys; open(sys.argv[1], 'a').write('x'); raise ValueError('no luck')"
+    jobs = [python("bad", crash, tmp_path / "attempts"), python("good", "print('fine')")]
+
+    bad, good = run_jobs(jobs, Local(1))
+
+    assert (tmp_path / "attempts").read_text() == "xxx"
+    assert bad.reason == "ended 3 times with status 1: ValueError: no luck"
+    assert good.status == 0
+    assert "bad: ended with status 1, begins again (attempt 3)" in capsys.readouterr().out.splitlines()
+
+
+def test_a_crash_after_a_new_checkpoint_is_the_first_again(tmp_path):
+    """Each attempt makes a checkpoint and crashes, as on a machine that is taken away again and again; then it ends."""
+    code = """
+import pathlib, sys
+checkpoint = pathlib.Path(sys.argv[1])
+checkpoint.parent.mkdir(parents=True, exist_ok=True)
+checkpoint.write_text((checkpoint.read_text() if checkpoint.exists() else "") + sys.argv[2])
+sys.exit(0 if len(checkpoint.read_text()) == 6 else 1)
+"""
+    checkpoint = str(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    resume = ["-c", code, checkpoint, "r"]
+
+    (ended,) = run_jobs([python("job", code, checkpoint, "s", run=str(tmp_path / "run"), resume=resume)], Local(1))
+
+    assert ended.status == 0
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").read_text() == "srrrrr"  # started once, then resumed
+
+
+def test_an_interrupted_job_is_no_failure_and_not_repeated(tmp_path):
+    kill = "import os, signal, sys; open(sys.argv[1], 'a').write('x'); os.kill(os.getpid(), signal.SIGTERM)"
+
+    (ended,) = run_jobs([python("job", kill, tmp_path / "attempts")], Local(1))
+
+    assert (tmp_path / "attempts").read_text() == "x"
+    assert ended.reason == "was interrupted"
+
+
+def test_a_refused_job_is_not_run_and_says_why(tmp_path, capsys):
+    jobs = [python("bad", "print('it ran')", refused="bad: has another configuration"), python("good", "print('fine')")]
+
+    bad, good = run_jobs(jobs, Local(1))
+
+    assert bad.reason == "has another configuration"
+    assert good.status == 0
+    assert "it ran" not in capsys.readouterr().out
+
+
+STUBBORN = """
+import signal, sys, time
+for number in (signal.SIGTERM, signal.SIGINT):
+    signal.signal(number, signal.SIG_IGN)
+print("ready", flush=True)
+time.sleep(1000)
+"""
+
+
+def test_a_job_that_ignores_the_signals_is_killed(monkeypatch):
+    monkeypatch.setattr(process, "_PATIENCE", ((signal.SIGTERM, 0.2), (signal.SIGTERM, 0.1), (signal.SIGKILL, 4.0)))
+    running = process.start(["-c", STUBBORN], 1)
+    assert running.stdout.readline() == "ready\n"
+
+    process.end(running)
+
+    assert process.follow(running, print) == -signal.SIGKILL
+
+
+def test_all_signals_to_a_job_come_within_30_seconds():
+    assert sum(seconds for _, seconds in process._PATIENCE) < 30
+    assert process._PATIENCE[-1][0] == signal.SIGKILL
+
+
+def test_a_training_ends_when_its_launcher_is_killed(tiny_config, tmp_path):
+    run = tmp_path / "run"
+    launcher = f"""
+from forbes.commands.jobs import Job, run_jobs
+from forbes.commands.launchers.local import Local
+command = ["-m", "forbes", "fit", {str(tiny_config)!r}, "--trainer.max_epochs", "-1", "--run_dir", {str(run)!r}]
+run_jobs([Job("job", command)], Local(1))
+"""
+    with subprocess.Popen([sys.executable, "-c", launcher], stdout=subprocess.PIPE, text=True) as parent:
+        while "epoch 2" not in parent.stdout.readline():
+            pass
+        parent.kill()
+    with open(run / ".lock", "rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # waits for ever for a training that goes on
+
+    assert main(["fit", "--resume", str(run), "--trainer.max_epochs", "1"]) == 0

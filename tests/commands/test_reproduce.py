@@ -10,26 +10,17 @@ import numpy as np
 import pytest
 import yaml
 from command_line import error_of
+from jobs_in_this_process import run_here
 
 from forbes.commands import budgets, reproduce, score_tables
 from forbes.commands.budgets import Family, Size
 from forbes.commands.cli import main
-from forbes.commands.jobs import Ended
 from forbes.commands.parsers.reproduce import BUDGETS, PARTS
 from forbes.commands.report import write_report
 from forbes.evaluation.claims import CLAIMS
 from forbes.evaluation.record import read_record
 from forbes.runs.configs import find_config
 from forbes.runs.folder import read_metrics
-
-
-def in_this_process(jobs, at_once, later=0.0, on_end=lambda ended: None):
-    """A process of its own would spend most of a test on its imports."""
-    statuses = {}
-    for job in jobs:
-        statuses[job.name] = main(list(job.command[job.command.index("forbes") + 1 :]))
-        on_end(Ended(job, statuses[job.name], 0.01, "its last <line>"))
-    return statuses
 
 
 @pytest.fixture
@@ -45,7 +36,7 @@ def tiny_plan(tiny_config, tmp_path, monkeypatch):
     monkeypatch.setattr(budgets, "_PARTS", nothing | {"strokes": lambda: plan})
     monkeypatch.setitem(budgets._SMOKE_FLAGS, "strokes", ())
     monkeypatch.setattr(budgets, "_FIGURES", ())
-    monkeypatch.setattr(reproduce, "run_jobs", in_this_process)
+    monkeypatch.setattr(reproduce, "run_jobs", run_here)
     return plan
 
 
@@ -101,7 +92,7 @@ def test_a_failed_job_is_named_and_stops_no_other(tiny_plan, tmp_path, capsys):
     assert f"jobs that failed: {tmp_path}/strokes/rssm-0. See {tmp_path}/report/index.html" in error
     page = page_of(tmp_path)
     assert "Jobs that failed" in page
-    assert f"<code>{tmp_path}/strokes/rssm-0</code>: its last &lt;line&gt;" in page
+    assert f"<code>{tmp_path}/strokes/rssm-0</code> ended with status 2: its last &lt;line&gt;" in page
     assert any("/elbo[" in name for name in read_record(tmp_path / "strokes" / "forbes-0"))
 
 
@@ -111,20 +102,20 @@ def test_a_failed_measurement_is_named_with_its_last_line(tiny_plan, tmp_path, m
 
     assert main(smoke(tmp_path)) == 2
 
-    assert "<code>evaluate-strokes-strokes-0</code>: its last &lt;line&gt;" in page_of(tmp_path)
+    assert "<code>evaluate-strokes-strokes-0</code> ended with status 2: its last &lt;line&gt;" in page_of(tmp_path)
 
 
 def test_interrupted_it_resumes_where_it_stopped(tiny_plan, tmp_path, monkeypatch):
     begun = []
 
-    def killed_in_the_second(jobs, at_once, later=0.0, on_end=None):
+    def killed_in_the_second(jobs, launcher, later=0.0, on_end=None):
         begun.append([job.name for job in jobs])
-        in_this_process(jobs[:1], at_once)
+        run_here(jobs[:1], launcher)
         raise KeyboardInterrupt
 
-    def counted(jobs, at_once, *others):
+    def counted(jobs, launcher, *others):
         begun.append([job.name for job in jobs])
-        return in_this_process(jobs, at_once, *others)
+        return run_here(jobs, launcher, *others)
 
     monkeypatch.setattr(reproduce, "_run_steps", lambda steps, *others: {})
     monkeypatch.setattr(reproduce, "run_jobs", killed_in_the_second)
@@ -139,9 +130,9 @@ def test_interrupted_it_resumes_where_it_stopped(tiny_plan, tmp_path, monkeypatc
 def test_a_step_is_repeated_only_if_a_run_was_trained_further(tiny_plan, tmp_path, monkeypatch):
     ran = []
 
-    def counted(jobs, at_once, *others):
+    def counted(jobs, launcher, *others):
         ran.extend(job.name for job in jobs)
-        return in_this_process(jobs, at_once, *others)
+        return run_here(jobs, launcher, *others)
 
     assert main(smoke(tmp_path)) == 0
     monkeypatch.setattr(reproduce, "run_jobs", counted)
@@ -163,9 +154,20 @@ def test_what_is_wrong_is_said_in_one_sentence(tiny_plan, tmp_path, capsys):
     other = error_of(capsys, "reproduce", "--budget", "small", "-o", tmp_path)
     assert other.startswith(f"{tmp_path}: has the runs of --budget smoke, expected small. Choose another folder")
     assert "invalid choice: 'theory'" in error_of(capsys, "reproduce", "--only", "theory")
-    tiny_plan[0] = tiny_plan[0]._replace(flags=("--model.free_nats", "1"))
-    changed = error_of(capsys, *smoke(tmp_path))
-    assert "strokes/rssm-0: was trained with model.init_args.free_nats = " in changed
+
+
+def test_a_changed_configuration_is_named_and_its_run_not_used(tiny_plan, tmp_path, capsys):
+    tiny_plan[1] = tiny_plan[1]._replace(flags=("--model.free_nats", "1"))
+    assert main(smoke(tmp_path)) == 0
+    tiny_plan[:] = [family._replace(flags=("--model.free_nats", "1")) for family in tiny_plan]
+
+    assert main(smoke(tmp_path)) == 2
+
+    out, error = capsys.readouterr()
+    assert f"jobs that failed: {tmp_path}/strokes/rssm-0. See" in error
+    reason = "was trained with model.init_args.free_nats = "
+    assert f"not finished: {tmp_path}/strokes/rssm-0 {reason}" in out
+    assert page_of(tmp_path).count(reason) == 2  # above, and where the run is listed
 
 
 def test_a_dry_run_lists_hours_and_trains_nothing(tiny_plan, tmp_path, capsys):

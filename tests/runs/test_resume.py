@@ -4,9 +4,8 @@ import os
 import shutil
 import signal
 
-import pandas as pd
 import pytest
-import torch
+from continued_runs import assert_same_run
 
 from forbes.commands.cli import main
 from forbes.runs.checkpoint import ResumeWholeEpochs, read_checkpoint
@@ -22,14 +21,6 @@ def straight(tiny_config, tmp_path_factory):
     run = tmp_path_factory.mktemp("runs") / "straight"
     assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run), *FOUR_EPOCHS]) == 0
     return run
-
-
-def assert_same_run(one, other):
-    pd.testing.assert_frame_equal(read_metrics(one), read_metrics(other), check_exact=True)
-    state, expected = (read_checkpoint(RunFolder(run).checkpoint) for run in (one, other))
-    assert state["global_step"] == expected["global_step"]
-    for part in ("state_dict", "optimizer_states"):
-        torch.testing.assert_close(state[part], expected[part], rtol=0, atol=0)
 
 
 def test_two_epochs_and_two_more_are_four_epochs(straight, tiny_run, tmp_path):
@@ -131,6 +122,8 @@ MIDDLE, BEFORE_LAST, LAST_OF_EPOCH, LAST = 6, 8, 9, 19
         (signal.SIGTERM, BEFORE_LAST, 10),  # not between the epoch's last update and its validation
         (signal.SIGTERM, LAST_OF_EPOCH, 10),
         (signal.SIGTERM, LAST, 20),
+        (signal.SIGUSR1, MIDDLE, 8),  # SLURM: before the end of the time, or a preemption
+        (signal.SIGUSR2, MIDDLE, 8),
     ],
 )
 def test_a_signal_stops_a_training_where_it_can_go_on(
@@ -187,6 +180,22 @@ def test_a_signal_does_not_part_the_batches_of_an_update(tiny_config, tmp_path, 
     assert main(["fit", "--resume", run]) == 0
 
     assert_same_run(run, straight)
+
+
+def test_signals_of_a_cluster_around_one_sigterm_lose_no_update(tiny_config, tmp_path, monkeypatch):
+    """As SLURM sends them at a preemption, and a launcher passes them on."""
+
+    def preempt(self, loss):
+        if self.global_step == MIDDLE:
+            for number in (signal.SIGTERM, signal.SIGUSR2, signal.SIGUSR1, signal.SIGUSR1):
+                os.kill(os.getpid(), number)
+
+    run = RunFolder(tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(WorldModel, "on_before_backward", preempt)
+        assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run)]) == 128 + signal.SIGTERM
+
+    assert read_checkpoint(run.checkpoint)["global_step"] == 8
 
 
 def test_a_second_signal_stops_at_once(tiny_config, tmp_path, monkeypatch):

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import ArgumentParser
+from forbes.commands.parsers.launchers import add_launcher_options
 
 __all__ = ["BUDGETS", "PARTS", "parser"]
 
@@ -33,12 +34,7 @@ def parser() -> ArgumentParser:
     command = ArgumentParser("forbes reproduce", _DESCRIPTION)
     command.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to train (default: all)")
     command.add_argument("--budget", choices=BUDGETS, default="small", help="how much to train (default: small)")
-    command.add_argument(
-        "--jobs",
-        type=positive,
-        metavar="N",
-        help="processes at a time (default: one per core, at most 4; with a GPU 1)",
-    )
+    add_launcher_options(command, "one per core, at most 4; with a GPU 1; measurements run here too")
     command.add_argument(
         *("-o", "--output"),
         type=Path,

@@ -1,0 +1,109 @@
+"""What running many trainings costs: one or two at a time on this machine, and the overhead of each launcher per job.
+
+    python benchmarks/scale.py                 two trainings and a few empty jobs; writes the table next to this file
+
+Ray is measured on a cluster of its own, of one node of this machine, if it is installed. Times are wall-clock times,
+since the processes compete for the cores, so the machine must be idle.
+"""
+
+import argparse
+import contextlib
+import importlib.util
+import io
+import itertools
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from train_step import common_options, conditions, publish, say
+
+from forbes.commands.jobs import Job, Launcher, run_jobs
+from forbes.commands.launchers.local import Local
+from forbes.commands.trainings import Training, training_job
+
+EMPTY = 5  # jobs
+
+
+def seconds(jobs: Sequence[Job], launcher: Launcher) -> float:
+    """Return the seconds from the first job's begin to the last one's end."""
+    start = time.monotonic()
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        ended = run_jobs(jobs, launcher)
+    if any(one.status for one in ended):
+        raise SystemExit(said.getvalue())
+    return time.monotonic() - start
+
+
+def trainings(folder: Path, number: int, updates: int) -> list[Job]:
+    """Return short trainings of FORBES on digit strokes."""
+    flags = ("--data.updates_per_epoch", str(updates), "--trainer.max_epochs", "1", "--trainer.callbacks", "[]")
+    flags += ("--data.validation_sequences", "20", "--trainer.num_sanity_val_steps", "0")
+    found = [Training("strokes/forbes", flags, seed, str(folder / str(seed))) for seed in range(number)]
+    return [training_job(training) for training in found]
+
+
+def side_by_side(options: argparse.Namespace) -> list[str]:
+    """Measure two trainings one after the other, which share all cores, and at the same time."""
+    table = ["| `--jobs` | threads of each | seconds for two trainings | updates/s together |", "|---:|---:|---:|---:|"]
+    times: dict[int, list[float]] = {1: [], 2: []}
+    for _ in range(options.repeats):
+        for at_once, found in times.items():
+            with tempfile.TemporaryDirectory() as folder:
+                found.append(seconds(trainings(Path(folder), 2, options.updates), Local(at_once)))
+            say(f"--jobs {at_once}: {found[-1]:.1f} s")
+    for at_once, found in times.items():
+        took = statistics.median(found)
+        threads = os.environ.get("OMP_NUM_THREADS") or max(1, (os.cpu_count() or 1) // at_once)
+        table.append(f"| {at_once} | {threads} | {took:.1f} | {2 * options.updates / took:.2f} |")
+    return table
+
+
+@contextmanager
+def launchers(folder: Path) -> Iterator[dict[str, Launcher]]:
+    """Yield a launcher of each kind, that runs one job at a time."""
+    found: dict[str, Launcher] = {"processes of this machine": Local(1)}
+    with contextlib.ExitStack() as stack:
+        if importlib.util.find_spec("ray"):
+            from ray.cluster_utils import Cluster
+
+            from forbes.commands.launchers.ray import Ray
+
+            cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+            stack.callback(cluster.shutdown)
+            found["Ray"] = Ray(folder, cluster.address, 1, 0.0, 1)
+        yield found
+
+
+def overhead(options: argparse.Namespace) -> list[str]:
+    """Measure jobs that do nothing, one after the other, without the first, which starts what is then reused."""
+    table = ["| launcher | first job, s | each further job, s |", "|---|---:|---:|"]
+    with tempfile.TemporaryDirectory() as folder, launchers(Path(folder)) as found:
+        for name, launcher in found.items():
+            times: list[float] = []
+            jobs = [Job(str(number), ["-c", "pass"]) for number in range(EMPTY * options.repeats)]
+            start = time.monotonic()
+            with contextlib.redirect_stdout(io.StringIO()):
+                run_jobs(jobs, launcher, on_end=lambda ended, times=times: times.append(time.monotonic()))
+            each = statistics.median(b - a for a, b in itertools.pairwise(times))
+            table.append(f"| {name} | {times[0] - start:.2f} | {each:.3f} |")
+            say(table[-1])
+    return table
+
+
+def main(options: argparse.Namespace) -> None:
+    """Measure, print and write the tables."""
+    about = f"FORBES on digit strokes, {options.updates} updates each, start-up included."
+    table = ["# What many trainings cost", "", conditions(options), ""]
+    table += ["## Two trainings on one machine", "", about, "", *side_by_side(options), ""]
+    table += ["## Overhead of a launcher", "", "Jobs that start Python and exit.", "", *overhead(options)]
+    publish(table, options)
+
+
+if __name__ == "__main__":
+    parser = common_options(__doc__, 3, "rounds")
+    parser.add_argument("--updates", type=int, default=200, help="updates of each training")
+    main(parser.parse_args())

@@ -1,0 +1,145 @@
+"""Trainings on a Ray cluster: if a worker, a node or the driver is lost, they continue, to the same bits."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import error_of
+from continued_runs import assert_same_run, starts
+
+import forbes
+from forbes.commands.cli import main
+from forbes.commands.jobs import run_jobs
+from forbes.commands.trainings import Training, training_job
+from forbes.runs.checkpoint import read_checkpoint
+from forbes.runs.folder import RunFolder
+
+ray = pytest.importorskip("ray")
+
+from ray.cluster_utils import Cluster  # noqa: E402
+
+from forbes.commands.launchers.ray import Ray  # noqa: E402
+
+EPOCHS = ("--trainer.max_epochs", "12")
+
+
+@pytest.fixture
+def cluster(head):
+    """A head that takes no jobs, and two nodes with room for one each."""
+    while len(head.worker_nodes) < 2:
+        head.add_node(num_cpus=1)
+    return head
+
+
+@pytest.fixture(scope="module")
+def head():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_worker_niceness", "0")  # with Ray's 15, a test next to others takes for ever
+        patch.setenv("RAY_raylet_start_wait_time_s", "120")
+        patch.setenv("PYTHONPATH", str(Path(forbes.__file__).parents[1]))  # of the nodes, which import this package
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+        yield cluster
+        cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def straight(tiny_config, tmp_path_factory):
+    run = tmp_path_factory.mktemp("straight") / "run"
+    assert main(["fit", "--config", str(tiny_config), *EPOCHS, "--run_dir", str(run)]) == 0
+    return run
+
+
+class Watched(Ray):
+    """Calls a function once, when a job has come to its third epoch."""
+
+    def __init__(self, *arguments, strike, shared=True):
+        super().__init__(*arguments)
+        self.strike, self.node, self.shared = strike, "", shared
+
+    def attempt(self, job, say):
+        if not self.shared:
+            self._mark.unlink(missing_ok=True)
+
+        def watch(line):
+            say(line)
+            if found := re.search(r"starts on .*, node (\w+)", line):
+                self.node = found[1]
+            if line.startswith("epoch 3/") and self.strike:
+                strike, self.strike = self.strike, None
+                strike(self.node)
+
+        return super().attempt(job, watch)
+
+
+def remove_node(cluster):
+    def remove(node):
+        (found,) = [each for each in cluster.worker_nodes if each.node_id == node]
+        cluster.remove_node(found, allow_graceful=False)
+
+    return remove
+
+
+def kill_worker(node):
+    """Kill the process of the task, whose child is the training."""
+    (found,) = subprocess.run(["pgrep", "-f", "^ray::.*/watched$"], capture_output=True).stdout.split()
+    os.kill(int(found), signal.SIGKILL)
+
+
+@pytest.mark.parametrize("shared", [True, False], ids=["shared folder", "brought back"])
+@pytest.mark.parametrize("lost", ["node", "worker"])
+def test_a_job_continues_elsewhere_to_the_same_bits(lost, shared, cluster, straight, tiny_config, tmp_path, capsys):
+    run = tmp_path / "watched"
+    strike = remove_node(cluster) if lost == "node" else kill_worker
+    launcher = Watched(tmp_path, cluster.address, 1, 0.0, 4, strike=strike, shared=shared)
+
+    (ended,) = run_jobs([training_job(Training(str(tiny_config), EPOCHS, 0, str(run)))], launcher)
+
+    assert (ended.status, launcher.strike) == (0, None)
+    assert ": lost: " in capsys.readouterr().out
+    first, second = starts(run)
+    assert (first, second > 0, second % 5) == (0, True, 0)
+    assert_same_run(run, straight)
+
+
+def test_an_interrupt_stops_the_job_with_a_checkpoint(cluster, straight, tiny_config, tmp_path):
+    run, job = tmp_path / "run", Training(str(tiny_config), EPOCHS, 0, str(tmp_path / "run"))
+
+    def interrupt(node):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(SystemExit):
+        run_jobs([training_job(job)], Watched(tmp_path, cluster.address, 1, 0.0, 4, strike=interrupt))
+    assert read_checkpoint(RunFolder(run).checkpoint)["global_step"] < 60
+
+    (ended,) = run_jobs([training_job(job)], Ray(tmp_path, cluster.address, 1, 0.0, 4))
+
+    assert ended.status == 0
+    assert_same_run(run, straight)
+
+
+def test_the_same_command_continues_after_its_driver_was_killed(cluster, straight, tiny_config, tmp_path):
+    arguments = ["compare", str(tiny_config), "--launcher", "ray", "--address", cluster.address, "-o", str(tmp_path)]
+    command = [sys.executable, "-m", "forbes", *arguments, "--scores", "elbo", "--samples", "2", "--", *EPOCHS]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as driver:
+        while "epoch 3/" not in driver.stdout.readline():
+            pass
+        driver.kill()
+
+    again = subprocess.run(command, capture_output=True, text=True)
+
+    assert again.returncode == 0, again.stderr
+    assert len(starts(tmp_path / "forbes-0")) == 2
+    assert_same_run(tmp_path / "forbes-0", straight)
+
+
+def test_without_a_cluster_it_says_how_to_start_one(tiny_config, tmp_path, capsys):
+    options = ["--launcher", "ray", "--address", "127.0.0.1:1", "-o", tmp_path]
+
+    error = error_of(capsys, "compare", tiny_config, *options)
+
+    assert error.startswith("--launcher ray: no Ray cluster at 127.0.0.1:1. Start one: ray start --head")
