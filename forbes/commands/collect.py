@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ from forbes.commands.episodes import count_steps
 from forbes.data.episodes.collection import MakePolicy, collect_episodes, random_policy
 from forbes.data.episodes.episode import EpisodeRecord
 from forbes.data.episodes.store import EpisodeWriter
-from forbes.envs import Environment, EnvironmentProcess, find_environment
+from forbes.data.episodes.worker import collect_in_parallel
+from forbes.envs import EnvironmentProcess, find_environment
 from forbes.errors import ForbesError
 from forbes.files import require_room
 from forbes.training.acting import AgentPolicy
@@ -22,14 +24,15 @@ __all__ = ["collect"]
 _RANDOM = "random"
 
 
-def collect(output: Path, episodes: int, policy: str, seed: int, **environment: Any) -> None:
-    """Play episodes in a separate process and store them. If interrupted, the same call resumes.
+def collect(output: Path, episodes: int, policy: str, seed: int, workers: int = 1, **environment: Any) -> None:
+    """Play episodes in separate processes and store them. If interrupted, the same call resumes.
 
     Args:
         output: folder of the episode store.
         episodes: number of stored episodes at the end, including those of earlier calls.
         policy: "random", or the run folder of an agent, which explores as in training.
         seed: random seed. Episode n is a function of (seed, n) and the policy.
+        workers: number of episodes that are played at the same time; they are the same, in the same order.
         environment: task, options of its constructor, timeout in seconds and time limit in steps; None for a default.
 
     Raises:
@@ -38,7 +41,8 @@ def collect(output: Path, episodes: int, policy: str, seed: int, **environment: 
     given = {name: value for name, value in environment.items() if value is not None}
     with _acting(policy, given) as (played_in, make_policy), EpisodeWriter(output) as writer:
         missing = max(0, episodes - writer.watermark)
-        played = collect_episodes(played_in, writer, make_policy, policy, episodes, seed)
+        play = collect_episodes if workers == 1 else partial(collect_in_parallel, workers)
+        played = play(played_in, writer, make_policy, policy, episodes, seed)
         records: list[EpisodeRecord] = []
         for record in track(played, f"Playing {played_in.describe()['task']}", total=missing):
             if not records:
@@ -48,7 +52,7 @@ def collect(output: Path, episodes: int, policy: str, seed: int, **environment: 
 
 
 @contextmanager
-def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, MakePolicy]]:
+def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[EnvironmentProcess, MakePolicy]]:
     """Yield the environment and the policy; an agent acts in the environment of its run."""
     if policy != _RANDOM:
         if given:
@@ -57,7 +61,7 @@ def _acting(policy: str, given: dict[str, Any]) -> Iterator[tuple[Environment, M
                 f"--policy {policy}: an agent acts in the environment of its run, expected no {flag}. Remove it"
             )
         with loaded_agent(policy, "cpu") as (agent, environment, _):
-            yield environment, AgentPolicy(agent, exploring=True)
+            yield environment, AgentPolicy.as_it_is(agent, exploring=True)
     elif "task" not in given:
         raise ForbesError(f"--policy {_RANDOM}: needs an environment. Name one: --task TASK")
     else:

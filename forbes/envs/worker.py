@@ -73,7 +73,7 @@ class EnvironmentProcess(Environment):
 
     def __init__(self, make: Callable[[], Environment], timeout: float = 60.0, time_limit: int = TIME_LIMIT) -> None:
         _require_importable(make)
-        self.make, self._timeout, self._time_limit = make, timeout, time_limit
+        self.make, self.timeout, self.time_limit = make, timeout, time_limit
         self._process: BaseProcess | None = None
         self._start()
 
@@ -90,14 +90,14 @@ class EnvironmentProcess(Environment):
             raise BrokenEnvironmentError(f"{self._name}: the episode failed, expected a reset before the next step")
         step = self._ask("step", action)
         self._steps += 1
-        if self._steps >= self._time_limit and not step.terminated:
+        if self._steps >= self.time_limit and not step.terminated:
             return step._replace(truncated=True)
         return step
 
     def describe(self) -> dict[str, Any]:
         """Return the environment's description with the time limit that applies: its own, or the environment's."""
-        own = self._description.get("time_limit", self._time_limit)
-        return self._description | {"time_limit": min(own, self._time_limit)}
+        own = self._description.get("time_limit", self.time_limit)
+        return self._description | {"time_limit": min(own, self.time_limit)}
 
     def close(self) -> None:
         """Kill the process."""
@@ -131,7 +131,7 @@ class EnvironmentProcess(Environment):
             self._connection.send((method, argument))
         except OSError:  # the process has died; the pipe may still contain its error, which `_receive` reads
             pass
-        step: Step = self._receive(method, self._timeout)
+        step: Step = self._receive(method, self.timeout)
         return step
 
     def _receive(self, method: str, timeout: float) -> Any:

@@ -64,3 +64,13 @@ def test_an_agent_does_not_add_to_the_episodes_of_another_task(run, tmp_path, ca
 
     assert "MountainHike" in capsys.readouterr().err
     assert len(EpisodeStore(store).records) == 1
+
+
+def test_workers_play_the_same_episodes_of_an_agent(run, tmp_path):
+    stores = [tmp_path / "one", tmp_path / "two"]
+    for number, store in enumerate(stores, start=1):
+        assert forbes("data", "collect", "--policy", run, "--episodes", 3, "--workers", number, "-o", store) == 0
+
+    hashes = [[record.sha256 for record in EpisodeStore(store).records.values()] for store in stores]
+    assert hashes[0] == hashes[1]
+    assert len(set(hashes[0])) == 3

@@ -292,7 +292,7 @@ def test_an_entry_of_a_dict_may_be_all_that_is_observed():
 def test_the_help_names_a_task_of_a_package(capsys):
     with pytest.raises(SystemExit):
         main(["data", "collect", "--help"])
-    assert "gymnasium:minigrid:MiniGrid-Empty-5x5-v0" in capsys.readouterr().out
+    assert "gymnasium:minigrid:MiniGrid-MemoryS7-v0" in capsys.readouterr().out
 
 
 NODES = Graph(Box(-1.0, 1.0, (2,)), None)

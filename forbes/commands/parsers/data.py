@@ -114,6 +114,12 @@ def _add_collect(of_data: _Parser) -> None:
     play.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help=_STORED)
     play.add_argument("--seed", type=int, default=0, help="episode n is a function of the seed and n (default: 0)")
     play.add_argument(
+        "--workers",
+        type=positive,
+        default=1,
+        help="number of episodes to play at the same time, each in its own process (default: 1)",
+    )
+    play.add_argument(
         "--action-repeat",
         type=positive,
         help="number of steps that each action is repeated (default: 2 in DeepMind Control, 1 in Gymnasium)",

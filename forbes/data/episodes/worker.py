@@ -1,21 +1,23 @@
-"""A worker process that plays episodes while this process trains."""
+"""A worker process that plays episodes while this process trains, or several that play them at the same time."""
 
 import atexit
 import pickle
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, suppress
+from itertools import cycle
 from multiprocessing.connection import Connection
 
 import torch
 
 from forbes.child import start_child
-from forbes.data.episodes.collection import ATTEMPTS, MakePolicy, play_whole
-from forbes.data.episodes.episode import Episode
+from forbes.data.episodes.collection import ATTEMPTS, MakePolicy, describe_environment, episode_seed, play_whole
+from forbes.data.episodes.episode import Episode, EpisodeRecord
+from forbes.data.episodes.store import EpisodeWriter
 from forbes.envs import TIME_LIMIT, Environment, EnvironmentProcess
 from forbes.errors import ForbesError
 
-__all__ = ["EpisodeWorker"]
+__all__ = ["EpisodeWorker", "collect_in_parallel"]
 
 
 class EpisodeWorker:
@@ -87,6 +89,46 @@ class EpisodeWorker:
     def _ask(self) -> None:
         with suppress(OSError):  # the process may have died since the last episode, which `finish` handles
             self._connection.send_bytes(self._message)
+
+
+def collect_in_parallel(
+    number: int,
+    environment: EnvironmentProcess,
+    writer: EpisodeWriter,
+    make_policy: MakePolicy,
+    policy: str,
+    until: int,
+    seed: int,
+) -> Iterator[EpisodeRecord]:
+    """Play several episodes at the same time, and store the same ones in the same order as `collect_episodes`.
+
+    Args:
+        number: number of processes that play.
+        environment: environment like those to play in, for the record.
+        writer: episode store to write to.
+        make_policy: function that makes the policy of an episode; must be picklable.
+        policy: name of the policy, for the record.
+        until: number of episodes that the store shall have had, its watermark.
+        seed: random seed for the episodes and their policies.
+
+    Yields:
+        Record of each episode, once it is safely stored.
+
+    Raises:
+        ForbesError: if an episode or its process fails three times, or cannot be stored.
+    """
+    numbers = range(writer.watermark, until)
+    with ExitStack() as stack:
+        workers = [
+            stack.enter_context(closing(EpisodeWorker(environment.make, environment.timeout, environment.time_limit)))
+            for _ in numbers[:number]
+        ]
+        for episode, worker in zip(numbers, workers, strict=False):
+            worker.begin(make_policy, episode, episode_seed(seed, episode))
+        for episode, worker in zip(numbers, cycle(workers), strict=False):
+            yield writer.append(worker.finish(), episode_seed(seed, episode), policy, describe_environment(environment))
+            if (later := episode + len(workers)) < until:
+                worker.begin(make_policy, later, episode_seed(seed, later))
 
 
 def _serve(connection: Connection, make: Callable[[], Environment], timeout: float, time_limit: int) -> None:

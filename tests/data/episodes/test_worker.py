@@ -1,5 +1,6 @@
 """Episodes that another process plays: the same as here, by the policy as it was, and every failure is said."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -14,8 +15,10 @@ import torch
 from processes import ends
 from toy_environments import Parrot, Troubled
 
-from forbes.data.episodes.collection import play
-from forbes.data.episodes.worker import EpisodeWorker
+from forbes.data.episodes.collection import collect_episodes, play, random_policy
+from forbes.data.episodes.store import EpisodeWriter
+from forbes.data.episodes.worker import EpisodeWorker, collect_in_parallel
+from forbes.envs import EnvironmentProcess
 from forbes.errors import ForbesError
 
 
@@ -163,3 +166,28 @@ def test_closing_a_player_within_an_episode_leaves_nothing(tmp_path):
     player.close()
 
     assert ends(int(policy.path.read_text()))
+
+
+@pytest.mark.parametrize(("workers", "until"), [(2, 5), (4, 3)])
+def test_several_workers_store_the_same_episodes(tmp_path, workers, until):
+    make = partial(Parrot, steps=8)
+    with EnvironmentProcess(make) as environment:
+        with EpisodeWriter(tmp_path / "one") as writer:
+            records = list(collect_episodes(environment, writer, random_policy, "random", until, 7))
+        with EpisodeWriter(tmp_path / "many") as writer:  # the first episode is there already
+            first = list(collect_episodes(environment, writer, random_policy, "random", 1, 7))
+            others = list(collect_in_parallel(workers, environment, writer, random_policy, "random", until, 7))
+
+    assert first + others == records  # also their hashes
+    assert len({record.sha256 for record in records}) == until
+
+
+def test_workers_end_when_one_fails(tmp_path):
+    make = partial(Troubled, "raises", tmp_path / "ledger", times=100)
+    before = set(multiprocessing.active_children())
+    with EnvironmentProcess(partial(Parrot)) as environment, EpisodeWriter(tmp_path / "store") as writer:
+        environment.make = make
+        with pytest.raises(ForbesError, match="failed 3 times"):
+            list(collect_in_parallel(2, environment, writer, random_policy, "random", 4, 0))
+
+    assert set(multiprocessing.active_children()) == before
