@@ -1,6 +1,6 @@
-"""What running many trainings costs: one or two at a time on this machine, and the overhead of each launcher per job.
+"""What scaling costs: two trainings at a time, one training in two processes, checkpoints, and launchers per job.
 
-    python benchmarks/scale.py                 two trainings and a few empty jobs; writes the table next to this file
+    python benchmarks/scale.py                 ten minutes on two cores; writes the table next to this file
 
 Ray is measured on a cluster of its own, of one node of this machine, if it is installed. Times are wall-clock times,
 since the processes compete for the cores, so the machine must be idle.
@@ -12,7 +12,9 @@ import importlib.util
 import io
 import itertools
 import os
+import re
 import statistics
+import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -23,7 +25,7 @@ from train_step import common_options, conditions, publish, say
 
 from forbes.commands.jobs import Job, Launcher, run_jobs
 from forbes.commands.launchers.local import Local
-from forbes.commands.trainings import Training, training_job
+from forbes.commands.trainings import Training, forbes_command, training_job
 
 EMPTY = 5  # jobs
 
@@ -60,6 +62,55 @@ def side_by_side(options: argparse.Namespace) -> list[str]:
         threads = os.environ.get("OMP_NUM_THREADS") or max(1, (os.cpu_count() or 1) // at_once)
         table.append(f"| {at_once} | {threads} | {took:.1f} | {2 * options.updates / took:.2f} |")
     return table
+
+
+def fit(folder: str, threads: int, *flags: str) -> tuple[float, float]:
+    """Train FORBES on digit strokes, and return the seconds it took and its updates per second after the start-up."""
+    common = ["strokes/forbes", "--run_dir", folder, "--trainer.callbacks", "[]", "--trainer.limit_val_batches", "0"]
+    start = time.monotonic()
+    ended = subprocess.run(
+        forbes_command("fit", *common, *flags),
+        env=os.environ | {"OMP_NUM_THREADS": str(threads)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return time.monotonic() - start, float(re.findall(r"([\d.]+) updates/s", ended.stdout)[-1])
+
+
+def one_training(options: argparse.Namespace) -> list[str]:
+    """Measure one training in one process and in two, with the same batches of 50 sequences."""
+    table = ["| processes | threads of each | updates/s | ratio |", "|---:|---:|---:|---:|"]
+    rates: dict[tuple[int, int], list[float]] = {(1, 1): [], (1, 2): [], (2, 1): []}
+    length = ("--data.updates_per_epoch", str(options.updates), "--trainer.max_epochs", "1")
+    for _ in range(options.repeats):
+        for (processes, threads), found in rates.items():
+            with tempfile.TemporaryDirectory() as folder:
+                found.append(fit(f"{folder}/run", threads, *length, "--trainer.devices", str(processes))[1])
+            say(f"{processes} processes, {threads} threads each: {found[-1]:.1f} updates/s")
+    first = statistics.median(rates[1, 1])
+    for (processes, threads), found in rates.items():
+        rate = statistics.median(found)
+        table.append(f"| {processes} | {threads} | {rate:.2f} | {rate / first:.2f} |")
+    return table
+
+
+def checkpoints(options: argparse.Namespace) -> list[str]:
+    """Measure what an epoch's end costs without a validation: almost only the checkpoint, written and synced."""
+    table = ["| updates between checkpoints | share of the time |", "|---:|---:|"]
+    costs, rates = [], []
+    for _ in range(options.repeats):
+        seconds_of = {}
+        for epochs in (1, 20):
+            length = ("--data.updates_per_epoch", str(options.updates // epochs), "--trainer.max_epochs", str(epochs))
+            with tempfile.TemporaryDirectory() as folder:
+                seconds_of[epochs], rate = fit(f"{folder}/run", 1, *length)
+        costs.append((seconds_of[20] - seconds_of[1]) / 19)
+        rates.append(rate)
+        say(f"a checkpoint: {costs[-1]:.3f} s")
+    cost, rate = statistics.median(costs), statistics.median(rates)
+    table += [f"| {every} | {cost / (cost + every / rate):.1%} |" for every in (10, 100, 500, 1000)]
+    return [f"A checkpoint of 14 MB takes {cost:.3f} s.", "", *table]
 
 
 @contextmanager
@@ -99,6 +150,8 @@ def main(options: argparse.Namespace) -> None:
     about = f"FORBES on digit strokes, {options.updates} updates each, start-up included."
     table = ["# What many trainings cost", "", conditions(options), ""]
     table += ["## Two trainings on one machine", "", about, "", *side_by_side(options), ""]
+    table += ["## One training in several processes", "", "`--trainer.devices N`, the same batches.", ""]
+    table += [*one_training(options), "", "## Checkpoints", "", *checkpoints(options), ""]
     table += ["## Overhead of a launcher", "", "Jobs that start Python and exit.", "", *overhead(options)]
     publish(table, options)
 
