@@ -3,6 +3,7 @@
 The build needs no network: mathematics becomes MathML, and no inventory of another project is read.
 """
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -28,6 +29,9 @@ extensions = [
     "sphinx_copybutton",
     "mathml",
 ]
+
+# Pages of names that a former version had would be found, and are linked from nowhere.
+shutil.rmtree(Path(__file__).parent / "generated", ignore_errors=True)
 
 root_doc = "docs/index"
 include_patterns = ["docs/**", "notebooks/**", "*.md", "*/README.md", "data/pretrained/README.md"]

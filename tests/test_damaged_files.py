@@ -93,7 +93,7 @@ def test_a_broken_provenance_is_said_before_a_training_goes_on(content, tiny_run
 def test_a_broken_record_is_said_before_anything_is_measured(name, tiny_run, tmp_path, monkeypatch, capsys):
     run = shutil.copytree(tiny_run, tmp_path / "run")
     (run / name).write_bytes(b"PK\x03\x04")
-    monkeypatch.setattr("forbes.commands.evaluate.load_runs", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr("forbes.commands.evaluate.load_all", lambda *_: pytest.fail("measured"))
 
     assert main(["evaluate", str(run)]) == 2
 

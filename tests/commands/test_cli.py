@@ -413,6 +413,7 @@ OVERLAYS = {
     "debug.yaml": "strokes/forbes.yaml",
     "dmc/cpu.yaml": "dmc/forbes_n1.yaml",
     "dmc/proprio.yaml": "dmc/forbes_n1.yaml",
+    "dmc/proprio_v3.yaml": "dmc/dreamerv3.yaml",
     "dmc/world_model_cpu.yaml": "dmc/world_model_rssm.yaml",
 }
 

@@ -107,6 +107,7 @@ def test_a_set_compared_with_itself_is_the_same(capsys, make_arrays, tmp_path):
 
 
 COMMANDS = ["build-strokes", "build-classifiers", "fetch", "compare-strokes", "show", "collect", "info", "check"]
+COMMANDS += ["import", "export"]
 
 
 def test_help_has_an_example_of_every_command(capsys):
