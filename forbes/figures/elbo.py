@@ -66,7 +66,11 @@ def elbo_against_updates(families: Sequence[FamilyCurves], references: Mapping[s
             axes.plot([], [], "D", color="none", markeredgecolor="black", markersize=4, label="final test")
         show_settled(axes, [curve for family in families for curve in family.curves])
         draw_references(axes, references)
-        title = bounds.pop().replace("elbo", "ELBO") if len(bounds) == 1 else "bound"
+        if len(bounds) == 1:
+            title = bounds.pop().replace("elbo", "ELBO")
+            axes.legend(loc="lower right")
+        else:
+            title = "bound"
+            figure.legend(loc="outside upper center")  # the names of the bounds would cover the curves
         axes.set(xlabel="updates", ylabel=f"validation {title}\nnats per sequence")
-        axes.legend(loc="lower right")
     return figure

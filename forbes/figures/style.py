@@ -187,8 +187,8 @@ def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", 
         return False
     for mean in near.values():
         (axes.axhline if along == "y" else axes.axvline)(mean, color=GREY, ls=":", lw=0.8)
-    margin = 0.03 * (high - low)
-    limits = min(low, *near.values()) - margin, max(high, *near.values()) + margin
+    low, high = min(low, *near.values()), max(high, *near.values())
+    limits = low - 0.03 * (high - low), high + 0.08 * (high - low)  # with room for the label
     best = max(near, key=lambda name: near[name])
     if along == "y":
         axes.set_ylim(*limits)

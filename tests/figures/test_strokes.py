@@ -122,10 +122,11 @@ def test_families_of_other_bounds_are_drawn_by_their_own(runs, tiny_config, tmp_
     for run, metric in [(particle, "test/elbo[bernoulli,S=16]"), (vector, "test/pll[bernoulli,K=128]")]:
         (tmp_path / run / "evaluation.json").write_text(json.dumps({metric: {"mean": -90.0}}))
 
-    (axes,) = draw_elbo([runs[0], particle, vector])["elbo"].axes
+    figure = draw_elbo([runs[0], particle, vector])["elbo"]
 
+    (axes,), (legend,) = figure.axes, figure.legends
     assert axes.get_ylabel() == "validation bound\nnats per sequence"
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+    assert [text.get_text() for text in legend.get_texts()] == [
         "FORBES, elbo[bernoulli,S=1]",
         "Particle, fivo[bernoulli,K=2]",
         "Vector, log_p[bernoulli]",
