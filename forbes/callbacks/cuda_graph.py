@@ -83,14 +83,17 @@ class Recording:
         self, module: WorldModel, batch: SequenceBatch, precision: Callable[[], AbstractContextManager[Any]]
     ) -> None:
         self.module, self.precision = module, precision
-        self.parameters = [*module.parameters()]
+        self.parameters = [parameter for parameter in module.parameters() if parameter.requires_grad]
         self.batch = SequenceBatch(*(values.clone() for values in batch))
         self.graph = torch.cuda.CUDAGraph()
+        buffers = [buffer.clone() for buffer in module.buffers()]
         try:
             with fusing():
                 self._warm_up()
                 with torch.cuda.graph(self.graph):
                     (self.loss, self.logs), self.gradients = self._compute()
+            for buffer, before in zip(module.buffers(), buffers, strict=True):
+                buffer.copy_(before)  # the updates of the warm-up do not count, e.g. in a `ReturnScale`
         except RuntimeError as error:  # of CUDA, and of the compiler
             name, reason = type(module).__name__, str(error).strip().partition("\n")[0]
             raise ForbesError(

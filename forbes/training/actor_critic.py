@@ -155,8 +155,6 @@ class ImaginationActorCritic(WorldModelAgent):
             filtered: the beliefs, `(B, T, …)`.
             start_mask: which of them an imagined trajectory starts from, bool `(B, T)`.
         """
-        if self.slow_critic is not None and self.training:
-            self._follow_critic(self.slow_critic)
         return actor_critic_losses(
             ImaginedWorld(self.model, self.reward, self.continues),
             ActorCritic(self.actor, self.critic, self.slow_critic, self.return_scale),
@@ -170,10 +168,11 @@ class ImaginationActorCritic(WorldModelAgent):
         )
 
     @torch.no_grad()
-    def _follow_critic(self, slow: ScalarHead) -> None:
-        """Move the moving average towards the critic, before an update of it."""
-        for average, parameter in zip(slow.parameters(), self.critic.parameters(), strict=True):
-            average.lerp_(parameter, self.slow_critic_rate)
+    def on_train_batch_end(self, outputs: Any, batch: SequenceBatch, batch_idx: int) -> None:
+        """Move the critic's moving average towards it."""
+        if self.slow_critic is not None:
+            for average, parameter in zip(self.slow_critic.parameters(), self.critic.parameters(), strict=True):
+                average.lerp_(parameter, self.slow_critic_rate)
 
     def groups(self) -> list[Group]:
         """See `SeededModule.groups`: three, so that clipping one gradient does not shrink the others."""

@@ -195,6 +195,26 @@ def test_the_branches_of_a_recording_add_up_to_the_whole(agent):
 
 
 @pytest.mark.usefixtures("without_device")
+def test_a_recording_changes_no_state_of_dreamerv3s_parts():
+    """The slow critic does not learn, and the range of the returns counts updates, not their preparation."""
+    torch.manual_seed(0)
+    arguments = {"observation_shape": (3, 28, 28), "action_dim": 2, "state_dim": 4, "hidden_dim": 6, "mlp_dim": 8}
+    agent = ImaginationActorCritic(
+        belief=GaussianBelief, horizon=3, control_dim=8, two_hot=True, scale_returns=True, slow_critic=0.5, **arguments
+    )
+    torch.nn.init.normal_(agent.critic.net[1].weight)  # an untrained critic gives 0, and all returns are equal
+    before = {name: values.clone() for name, values in agent.state_dict().items()}
+
+    recorded = Recording(agent, make_batch(0), nullcontext)
+
+    after = agent.state_dict()
+    assert all(torch.equal(values, after[name]) for name, values in before.items())
+    agent.return_scale(torch.ones(2, 3), torch.ones(2, dtype=torch.bool))
+    assert agent.return_scale.percentiles.min() > 0  # an update does move it
+    assert recorded(make_batch(0)).loss.isfinite()
+
+
+@pytest.mark.usefixtures("without_device")
 def test_a_scaled_loss_has_scaled_gradients(agent):
     recorded = Recording(agent, make_batch(0), nullcontext)
     _, _, once = results(recorded, agent, make_batch(0))

@@ -210,11 +210,10 @@ def test_the_actors_returns_are_divided_by_their_range():
 
 def test_the_slow_critic_is_the_critics_moving_average():
     ours, batch = agent(slow_critic=0.25), make_batch()
-    filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
     start = [parameter.clone() for parameter in ours.slow_critic.parameters()]
     torch.nn.init.ones_(ours.critic.net[1].weight)
 
-    ours.control_losses(filtered, batch.mask)
+    ours.on_train_batch_end(None, batch, 0)
 
     for before, fast, slow in zip(start, ours.critic.parameters(), ours.slow_critic.parameters(), strict=True):
         torch.testing.assert_close(slow.data, 0.75 * before + 0.25 * fast)
