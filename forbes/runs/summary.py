@@ -13,6 +13,7 @@ from forbes.errors import ForbesError
 from forbes.reading import is_number, read_json
 from forbes.runs.folder import RunFolder, read_config
 from forbes.runs.naming import method_of, task_of, with_suffix
+from forbes.runs.signals import STOPPED
 
 __all__ = ["RunSummary", "find_runs", "objective_of", "summarise"]
 
@@ -127,7 +128,7 @@ def _state(run: RunFolder, last: dict[str, Any]) -> str:
         return "unknown"
     status = last.get("exit_status")
     if status is not None:
-        return "finished" if status == 0 else "stopped" if status in (130, 143) else "failed"
+        return "finished" if status == 0 else "stopped" if status in STOPPED else "failed"
     return "running" if _is_alive(run) else "failed"
 
 

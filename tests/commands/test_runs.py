@@ -56,7 +56,8 @@ def test_the_table_says_what_was_trained_how_far_and_how_well(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("status", "state"), [(0, "finished"), (130, "stopped"), (143, "stopped"), (3, "failed"), (2, "failed")]
+    ("status", "state"),
+    [(0, "finished"), (130, "stopped"), (143, "stopped"), (138, "stopped"), (3, "failed"), (2, "failed")],
 )
 def test_the_state_is_that_of_the_exit_status(status, state, tmp_path, capsys):
     write(tmp_path / "runs" / "a", status)
