@@ -18,11 +18,8 @@ __all__ = ["ATTEMPTS", "Ended", "Job", "Launcher", "checkpoint_time", "run_jobs"
 
 ATTEMPTS = 3
 """A job is given up when it has crashed so many times in a row without a new checkpoint."""
-_FINAL = {
-    0,
-    2,
-    3,
-} | STOPPED  # finished, an error that the user can fix, a divergence, a signal: a repeat changes nothing
+_FINAL = {0, 2, 3} | STOPPED
+"""Exit statuses that a repeat would not change: finished, an error that the user can fix, a divergence, a signal."""
 
 
 class Job(NamedTuple):

@@ -45,11 +45,10 @@ def main(argv: Sequence[str]) -> None:
         _print_plan(planned, missing, hours)
     total = sum(hours[one.training.folder] for one in missing)
     later = sum(step.hours for step in [*measures(planned, args.budget, folder), *figures(planned, folder)])
+    here = f": {(total + later) / at_once:.1f} hours with --jobs {at_once}" if args.launcher == "local" else ""
     print(
         f"{len(missing)} of {len(planned)} trainings are missing and take about {total:.1f} hours, measurements and "
-        f"figures {later:.1f}"
-        + f": {(total + later) / at_once:.1f} hours with --jobs {at_once}"
-        * (args.launcher == "local"),
+        f"figures {later:.1f}{here}",
         flush=True,
     )
     if args.dry_run:

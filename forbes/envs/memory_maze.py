@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from forbes.envs.base import Environment, Step
 from forbes.envs.dm_control import environment_variable
+from forbes.envs.images import to_image
 from forbes.envs.rendering import choose_backend
 from forbes.errors import ForbesError
 
@@ -47,14 +48,14 @@ class MemoryMaze(Environment):
         if self._environment is not None:
             self._environment.close()
         self._environment = self._make(seed=seed, image_only_obs=True)
-        return Step(_to_image(self._environment.reset().observation))
+        return Step(to_image(self._environment.reset().observation))
 
     def step(self, action: NDArray[np.float32]) -> Step:
         """Apply an action, float32 `(6,)`, one-hot."""
         last = self._environment.step(int(action.argmax()))
         ends = last.last()
         return Step(
-            _to_image(last.observation), float(last.reward), ends and last.discount == 0, ends and last.discount != 0
+            to_image(last.observation), float(last.reward), ends and last.discount == 0, ends and last.discount != 0
         )
 
     def describe(self) -> dict[str, Any]:
@@ -71,7 +72,3 @@ def _load(size: str, backend: str) -> Any:
     except ImportError as error:
         raise ForbesError(f"memory_maze_{size}: {error}. pip install 'forbes[memory-maze]'") from error
     return getattr(tasks, f"memory_maze_{size}")
-
-
-def _to_image(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(pixels.transpose(2, 0, 1))  # (3, H, W)

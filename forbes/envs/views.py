@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from forbes.envs.base import Environment, Step, check_environment
 from forbes.errors import ForbesError
+from forbes.reading import is_number
 
 __all__ = ["VELOCITIES", "VIEWS", "BlankUntil", "Delay", "Flicker", "Hide", "Noise", "Occlude", "View", "look_through"]
 
@@ -124,7 +125,7 @@ class Flicker(View):
 
     def __init__(self, environment: Environment, probability: float) -> None:
         super().__init__(environment, probability)
-        self._require(_is_number(probability) and 0 <= probability <= 1, "a probability in [0, 1]")
+        self._require(is_number(probability) and 0 <= probability <= 1, "a probability in [0, 1]")
 
     def show(self, observation: NDArray[Any]) -> NDArray[Any]:
         """Return o_t, or zeros."""
@@ -147,7 +148,7 @@ class Occlude(View):
     def __init__(self, environment: Environment, box: Sequence[float]) -> None:
         super().__init__(environment, box)
         self._require(len(self.observation_shape) == 3, "images to occlude, not vectors. `hide` leaves out dimensions")
-        numbers = isinstance(box, list | tuple) and len(box) == 4 and all(_is_number(x) and 0 <= x <= 1 for x in box)
+        numbers = isinstance(box, list | tuple) and len(box) == 4 and all(is_number(x) and 0 <= x <= 1 for x in box)
         self._require(numbers, "left, top, right and bottom as fractions in [0, 1]")
         self.value, (_, height, width) = list(box), self.observation_shape
         left, top, right, bottom = (
@@ -180,7 +181,7 @@ class Noise(View):
 
     def __init__(self, environment: Environment, std: float) -> None:
         super().__init__(environment, std)
-        self._require(_is_number(std) and 0 <= std < np.inf, "a standard deviation of at least 0")
+        self._require(is_number(std) and 0 <= std < np.inf, "a standard deviation of at least 0")
 
     def show(self, observation: NDArray[Any]) -> NDArray[Any]:
         """Return the noisy observation."""
@@ -245,7 +246,3 @@ def look_through(make: Callable[[], Environment], views: dict[str, Any]) -> Envi
     for option, value in views.items():
         environment = VIEWS[option](environment, value)
     return environment
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -153,7 +153,7 @@ def _belief(model: BeliefModel, observation: Tensor, action: Tensor) -> Tensor:
 
 
 def _exchanged(values: Tensor, later: Tensor) -> Tensor:
-    """Give each sequence `(B, T, ...)` the steps of another one where `later`, `(T,)`, is set."""
+    """Replace the steps where `later`, `(T,)`, is True by those of another sequence of the batch, `(B, T, ...)`."""
     return torch.where(later.view(1, -1, *[1] * (values.ndim - 2)), values.roll(1, 0), values)
 
 

@@ -137,7 +137,21 @@ class OnePixel(Likelihood):
         return softplus(output.logsumexp((-3, -2, -1)))
 
 
-class Normal(Likelihood):
+class _FixedStd(Likelihood):
+    """Independent normal numbers of one fixed standard deviation around the output."""
+
+    std: float
+
+    def sample(self, output: Tensor) -> Tensor:
+        """See `Likelihood.sample`."""
+        return output + self.std * torch.randn_like(output)
+
+    def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
+        """See `Likelihood.log_prob`."""
+        return _normal(output, target, self.std, tuple(range(-self.rank, 0)))
+
+
+class Normal(_FixedStd):
     r"""Pixels of fixed spread: :math:`N(x/scale - 1/2;\, output,\, \sigma^2)`, constant kept.
 
     With b < 8 bits, bytes are made coarser and the steps between them filled with noise, new for every reading, as in
@@ -185,16 +199,8 @@ class Normal(Likelihood):
         """See `Likelihood.picture`."""
         return observation.float() / self.scale
 
-    def sample(self, output: Tensor) -> Tensor:
-        """See `Likelihood.sample`."""
-        return output + self.std * torch.randn_like(output)
 
-    def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
-        """See `Likelihood.log_prob`."""
-        return _normal(output, target, self.std, (-3, -2, -1))
-
-
-class VectorNormal(Likelihood):
+class VectorNormal(_FixedStd):
     r"""Vectors of numbers, each of fixed spread: :math:`N(x;\, output,\, \sigma^2)`.
 
     Args:
@@ -221,16 +227,8 @@ class VectorNormal(Likelihood):
         """See `Likelihood.mean`."""
         return output
 
-    def sample(self, output: Tensor) -> Tensor:
-        """See `Likelihood.sample`."""
-        return output + self.std * torch.randn_like(output)
 
-    def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
-        """See `Likelihood.log_prob`."""
-        return _normal(output, target, self.std, (-1,))
-
-
-class SymlogNormal(Likelihood):
+class SymlogNormal(_FixedStd):
     r"""Vectors of numbers of unknown scale: the symlog of each is normal (DreamerV3, arXiv 2301.04104).
 
     .. math:: \log p(x) = \sum_i \log N(\mathrm{symlog}\,x_i;\, u_i,\, \sigma^2) - \log(1 + |x_i|), \qquad
@@ -267,13 +265,9 @@ class SymlogNormal(Likelihood):
         """See `Likelihood.picture`."""
         return observation.float()
 
-    def sample(self, output: Tensor) -> Tensor:
-        """See `Likelihood.sample`."""
-        return output + self.std * torch.randn_like(output)
-
     def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
         """See `Likelihood.log_prob`; the derivative of symlog at x is exp(-abs(symlog x))."""
-        return _normal(output, target, self.std, (-1,)) - target.abs().sum(-1)
+        return super().log_prob(output, target) - target.abs().sum(-1)
 
 
 class OneHot(Likelihood):

@@ -33,7 +33,7 @@ class SeededModule(LightningModule, ABC):
     r"""A LightningModule whose training is a function of its seed, also when it is interrupted and resumed.
 
     The noise of an update depends on the seed, the number of the update and the rank, that of a validation on the seed
-    alone. The learning rate of Adam in update n of N is
+    and the number of the batch. The learning rate of Adam in update n of N is
 
     .. math:: \min(1, \tfrac{n + 1}{\mathrm{warmup}})\,\mathrm{rate} \quad\text{and with a cosine times}\quad
               \tfrac12 (1 + \cos \tfrac{\pi n}{N})
