@@ -89,7 +89,7 @@ def grid(config: str, keys: Sequence[str]) -> list[Point]:
     points = []
     for chosen in itertools.product(*values.values()):
         parts = [f"{name}={_plain(value)}" for name, value in zip(names, chosen, strict=True)]
-        points.append(Point("_".join([Path(config).stem, *parts]), dict(zip(values, chosen, strict=True))))
+        points.append(Point(",".join([Path(config).stem, *parts]), dict(zip(values, chosen, strict=True))))
     found = [point.name for point in points]
     if twice := next((name for name in found if found.count(name) > 1), None):
         raise ForbesError(f"--sweep: two points of the grid are called {twice}. Remove or change one of the values")

@@ -12,6 +12,7 @@ from forbes.commands import trainings
 from forbes.commands.cli import main
 from forbes.commands.sweep import grid
 from forbes.runs.folder import read_metrics
+from forbes.runs.naming import with_suffix
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -31,7 +32,7 @@ def test_the_best_point_is_that_of_the_best_validation(tiny_config, tmp_path, ca
     best = {}
     for rate in ("1e-3", "1e-1"):
         for dimension in ("2", "3"):
-            runs = [tmp_path / f"forbes_learning_rate={rate}_state_dim={dimension}-{seed}" for seed in range(2)]
+            runs = [tmp_path / f"forbes,learning_rate={rate},state_dim={dimension}-{seed}" for seed in range(2)]
             metrics = [read_metrics(run) for run in runs]
             (name,) = {name for each in metrics for name in each if re.match(r"val/elbo\[", name)}
             best[rate, dimension] = sum(each[name].max() for each in metrics) / 2
@@ -49,8 +50,15 @@ def test_every_combination_is_one_point_and_its_name_has_the_values():
     points = grid("configs/strokes/forbes.yaml", ["model.state_dim=4,8", "data.length=20,30,40"])
 
     assert len(points) == 6
-    assert points[1].name == "forbes_state_dim=4_length=30"
+    assert points[1].name == "forbes,state_dim=4,length=30"
     assert points[1].flags == ("--model.state_dim=4", "--data.length=30")
+
+
+@pytest.mark.parametrize(("config", "method"), [("rssm.yaml", "RSSM"), ("rssm_wide.yaml", "RSSM wide")])
+def test_the_values_in_the_name_of_a_run_are_no_part_of_its_method(config, method):
+    (point,) = grid(config, ["model.learning_rate=1e-3"])
+
+    assert with_suffix("RSSM", f"runs/sweep/{point.name}-0") == method
 
 
 def test_commas_inside_brackets_and_quotes_do_not_part_values():
@@ -81,7 +89,7 @@ def test_what_is_wrong_is_said_in_one_sentence_before_training(tiny_config, tmp_
     assert "expected KEY=V1,V2" in error(tiny_config, "--sweep", "model.learning_rate=1,,2")
     assert "expected KEY=V1,V2" in error(tiny_config, "--sweep", "model.learning_rate=[1,2")
     twice = error(tiny_config, "--sweep", "model.state_dim=2,2")
-    assert twice.startswith("--sweep: two points of the grid are called forbes_state_dim=2. Remove or change")
+    assert twice.startswith("--sweep: two points of the grid are called forbes,state_dim=2. Remove or change")
     assert "a key is given twice" in error(tiny_config, "--sweep", "model.state_dim=2", "model.state_dim=3")
     assert "takes one configuration" in error(tiny_config, tiny_config, "--sweep", "model.state_dim=2")
     assert "nothing is evaluated. Remove --samples" in error(
