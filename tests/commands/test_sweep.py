@@ -72,13 +72,13 @@ def test_commas_inside_brackets_and_quotes_do_not_part_values():
         "trainer.callbacks": "[]",
         "trainer.profiler": "'a,b'",
     }
-    assert points[0].name == "tiny_belief=_class_path_FlowBelief_init_args_layers_2__callbacks=_A_B__profiler=_a_b_"
+    assert points[0].name == "tiny,belief=_class_path_FlowBelief_init_args_layers_2_,callbacks=_A_B_,profiler=_a_b_"
 
 
 def test_keys_with_the_same_last_part_keep_their_sections():
     (point,) = grid("tiny", ["model.length=1", "data.length=2"])
 
-    assert point.name == "tiny_model.length=1_data.length=2"
+    assert point.name == "tiny,model.length=1,data.length=2"
 
 
 def test_what_is_wrong_is_said_in_one_sentence_before_training(tiny_config, tmp_path, capsys):
