@@ -69,6 +69,14 @@ def test_tensorboard_shows_each_picture_and_the_hyperparameters(fit):
     assert "_hparams_/session_start_info" in board.summary_metadata
 
 
+def test_wandb_offline_keeps_each_picture(fit):
+    pytest.importorskip("wandb")
+    assert fit("--trainer.logger", "WandbLogger", "--trainer.logger.offline", "true") == 0
+
+    kept = Path("run/wandb/latest-run/files/media/images/figures").glob("*.png")
+    assert sorted(picture.name.split("_")[0] for picture in kept) == ["elbo", "elbo", "predictions"]
+
+
 def test_a_logger_with_the_methods_of_wandb_gets_each_picture(fit, monkeypatch):
     monkeypatch.setitem(sys.modules, "a_board", sys.modules[__name__])
     monkeypatch.setattr(Board, "kept", [])
