@@ -25,7 +25,7 @@ def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
     runs = load_all(args.runs, args.model, args.data, needs=("sample",))
-    found = [calibrate_run(run, args.sequences, args.time, args.samples, args.seed) for run in runs]
+    found = [calibrate_run(run, args.sequences, args.time, args.samples, args.seed, args.particles) for run in runs]
     _print(runs, found, args.samples)
     styles = method_styles(run_titles(runs))
     beliefs = [

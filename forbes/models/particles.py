@@ -29,7 +29,7 @@ from forbes.performance.precision import full_precision
 from forbes.shapes import printed_by_shape
 
 __all__ = ["ParticleModel", "Particles", "effective_sample_size", "run_particles", "soft", "systematic"]
-__all__ += ["systematic_resampling"]
+__all__ += ["sample_weighted_beliefs", "systematic_resampling"]
 
 Resampling: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Normalised log-weights `(K, B)` to ancestors `(K, B)` and the log-weights of their children `(K, B)`."""
@@ -140,6 +140,27 @@ def run_particles(
         log_before = torch.where(again, log_child, log_weight)
 
 
+def sample_weighted_beliefs(model: PosteriorModel, encoded: EncodedSequence, number: int) -> State:
+    """Sample (h, s) after the last step, `(B, ...)`, from K weighted particles; the posterior is their proposal.
+
+    A posterior trajectory never reconsiders an earlier state. Weights and resampling do, so that this is a sample of
+    the exact belief of the model as K grows, whatever its posterior is.
+
+    Args:
+        model: any model with a posterior.
+        encoded: B sequences of T steps.
+        number: K.
+    """
+    return _draw_last(run_particles(model, encoded, number, systematic, model.log_likelihood, torch.float64), 1)
+
+
+def _draw_last(steps: Iterator[Particles], samples: int) -> State:
+    """Draw a systematic sample of the last weighted set, `(N B, ...)`."""
+    last = deque(steps, maxlen=1)[0]
+    uniform = torch.rand_like(last.log_weight[0])  # (B,)
+    return _choose(last.filtered, systematic_resampling(last.log_weight, uniform, samples))
+
+
 def _choose(filtered: Filtered, index: Tensor) -> State:
     """Take particles `(K B, ...)` by their index within each sequence, `(N, B)`: `(N B, ...)`; h and s go together."""
     sequences = index.shape[1]
@@ -195,9 +216,7 @@ class ParticleModel(StateSpaceModel):
 
     def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
         """See `BeliefModel.sample_beliefs`: a systematic sample of one weighted set, with repetitions."""
-        last = deque(self._run(encoded), maxlen=1)[0]
-        uniform = torch.rand_like(last.log_weight[0])  # (B,)
-        return _choose(last.filtered, systematic_resampling(last.log_weight, uniform, samples))
+        return _draw_last(self._run(encoded), samples)
 
     def predictive_log_prob(self, encoded: EncodedSequence, log_likelihood: FrameLogProb) -> Tensor:
         """See `BeliefModel.predictive_log_prob`: the weighted mean over one set of particles."""

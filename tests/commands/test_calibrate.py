@@ -77,5 +77,6 @@ def test_particles_are_ranked_and_a_stateless_model_is_refused(tmp_path, capsys)
 
     assert main(["calibrate", particle, *numbers]) == 0
     assert "Particle" in capsys.readouterr().out
+    assert main(["calibrate", particle, *numbers, "--particles", "8"]) == 0
     assert main(["calibrate", vector, *numbers]) == 2
     assert "a Vector model has no state that could be ranked" in capsys.readouterr().err

@@ -10,6 +10,7 @@ _DESCRIPTION = """\
 Check the calibration of trained models against themselves, without ground truth.
 
   forbes calibrate runs/compare/forbes-0 runs/compare/rssm-0 -o figures
+  forbes calibrate pretrained:strokes-forbes --particles 32 --samples 19
 
 States and observations are sampled from the model's own prior. The model filters the observations, and the sampled
 state is ranked among samples of the belief. If the filter is exact, the ranks are uniform. A small p-value shows that
@@ -26,6 +27,11 @@ def parser() -> RunsParser:
         "--sequences", type=positive, default=1000, help="sequences sampled from the model, N (default: 1000)"
     )
     command.add_argument("--samples", type=positive, default=99, help="samples of each belief, L (default: 99)")
+    command.add_argument(
+        "--particles",
+        type=positive,
+        help="check a belief of K weighted particles, proposed by the posterior (default: the model's own belief)",
+    )
     command.add_argument("--time", type=positive, default=15, help="step whose belief is checked (default: 15)")
     command.add_argument("--seed", type=int, default=0, help="random seed for all samples (default: 0)")
     command.add_argument("-o", "--output", type=Path, default=Path("figures"), help="output folder (default: figures)")

@@ -10,7 +10,9 @@ from forbes.models import VectorModel
 __all__ = ["calibrate_run"]
 
 
-def calibrate_run(run: TrainedRun, sequences: int, time: int, samples: int, seed: int = 0) -> SelfCalibration:
+def calibrate_run(
+    run: TrainedRun, sequences: int, time: int, samples: int, seed: int = 0, particles: int | None = None
+) -> SelfCalibration:
     """Rank the states that a run's model imagines, for the actions of the first sequences of its training split.
 
     Args:
@@ -19,6 +21,7 @@ def calibrate_run(run: TrainedRun, sequences: int, time: int, samples: int, seed
         time: step whose belief is checked, counted from 1.
         samples: number of samples of each belief, L.
         seed: random seed for all samples.
+        particles: see `self_calibration`.
 
     Raises:
         ForbesError: if the model has no state, the data have too few sequences or steps, or the training diverged.
@@ -32,6 +35,6 @@ def calibrate_run(run: TrainedRun, sequences: int, time: int, samples: int, seed
         raise ForbesError(f"--sequences {sequences}: {run.path} was trained on {size} sequences. Choose fewer")
     action = run.data.sequences("train", torch.arange(sequences), time).action
     try:
-        return self_calibration(run.model, action, samples, seed)
-    except ForbesError as error:  # e.g. if the training diverged
+        return self_calibration(run.model, action, samples, seed, particles)
+    except ForbesError as error:  # e.g. the training diverged
         raise ForbesError(f"{run.path}: {error}") from error

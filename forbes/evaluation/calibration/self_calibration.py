@@ -3,17 +3,21 @@ r"""Self-calibration: is the filter of a trained model exact for the model's own
 Sample :math:`(s, o)` from the model's prior, filter o, and rank the sampled :math:`s_t` among samples of the belief
 :math:`q(s_t \mid o_{1:t})`. The ranks are uniform if the belief is the exact filtering posterior of the model
 (simulation-based calibration, Talts et al., 2018, arXiv 1804.06788). A filter trained with the ELBO is expected to
-fail: its beliefs are too narrow (`forbes theorem`), and the ranks pile up at both ends.
+fail: its beliefs are too narrow (`forbes theorem`), and the ranks pile up at both ends. It never reconsiders an earlier
+state; a belief of weighted particles, with the same posterior as their proposal, does.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from forbes.errors import ForbesError
 from forbes.evaluation.calibration.ranks import TwoSampleTest, ranks, tarp_ranks, two_sample_test
 from forbes.evaluation.scores import LogMeanExp
 from forbes.models import BeliefModel, EncodedSequence, Filtered, PosteriorModel, has_posterior
+from forbes.models.particles import sample_weighted_beliefs
 from forbes.seeding import derive_seed, forked, generator
 
 __all__ = ["SelfCalibration", "self_calibration"]
@@ -37,7 +41,9 @@ class SelfCalibration(NamedTuple):
 
 
 @torch.no_grad()
-def self_calibration(model: BeliefModel, action: Tensor, samples: int, seed: int = 0) -> SelfCalibration:
+def self_calibration(
+    model: BeliefModel, action: Tensor, samples: int, seed: int = 0, particles: int | None = None
+) -> SelfCalibration:
     """Rank the last state of each sequence that the model imagines.
 
     Args:
@@ -45,13 +51,22 @@ def self_calibration(model: BeliefModel, action: Tensor, samples: int, seed: int
         action: actions of N sequences up to the step that is checked, `(N, t, A)`.
         samples: number of samples per belief, L. Each uses its own trajectory, since the belief is over (h, s).
         seed: random seed for all samples.
+        particles: K, to check `sample_weighted_beliefs` in place of the model's own beliefs.
+
+    Raises:
+        ForbesError: if there are weighted particles to check, but the model's posterior has no density.
     """
+    draw_belief = partial(model.sample_beliefs, samples=1)
+    if particles is not None:
+        if not has_posterior(model):
+            raise ForbesError("a belief without a density cannot be weighted. Leave out --particles")
+        draw_belief = partial(sample_weighted_beliefs, model, number=particles)
     with forked(action.device, derive_seed(seed, "self-calibration", 0)):
         rollout = model.imagine(model.initial(len(action)), action)
         observation = model.likelihood.sample(model.decode(rollout.features))  # (N, t, *O)
         encoded = EncodedSequence(observation, model.embed_target(observation), action)
         truth = rollout.state[:, -1]  # (N, D)
-        draws = torch.stack([model.sample_beliefs(encoded, 1).state for _ in range(samples + 1)])  # (L + 1, N, D)
+        draws = torch.stack([draw_belief(encoded).state for _ in range(samples + 1)])  # (L + 1, N, D)
         log_belief = _log_belief(model, encoded, torch.cat((truth[None], draws[1:]))) if has_posterior(model) else None
     draw = generator(seed, "ties", 0)
     truth, draws = truth.double().cpu(), draws.double().cpu()

@@ -40,6 +40,20 @@ def test_a_too_narrow_filter_is_caught_and_covers_too_little():
     assert coverage(found.density, SAMPLES, torch.tensor([0.9])) < 0.8
 
 
+def test_weights_make_a_calibrated_belief_of_a_wrong_posterior():
+    model, _ = gaussian()
+    with torch.no_grad():
+        model.posterior.parameters_of.bias[2:] += 0.7  # of softplus(·): nearly twice the spread
+    steps = torch.zeros(SEQUENCES, 3, 0)
+
+    trajectory = self_calibration(model, steps, SAMPLES)
+    weighted = self_calibration(model, steps, SAMPLES, particles=32)
+
+    assert p_values(trajectory).max() < 1e-6
+    assert p_values(weighted).min() > 1e-3 / 4
+    assert weighted.classifier.p_value > 1 / 200
+
+
 def test_depends_on_the_seed_alone_and_leaves_the_random_state():
     model, _ = gaussian()
     before = torch.get_rng_state()
