@@ -1,27 +1,34 @@
 r"""Reference scores that a model should exceed: log p of the same sequences under models without a belief.
 
-For digit strokes, n-grams of pen moves (`forbes.evaluation.ngram`). For images with a Gaussian likelihood, two constant
-predictions with the model's own standard deviation: the previous frame, and the mean frame of the training split,
+For digit strokes, n-grams of pen moves (`forbes.evaluation.ngram`). For images and vectors with a Gaussian likelihood,
+predictions with the model's own standard deviation: the mean of the training split, and the previous observation,
 
-.. math:: \log p(o_{1:T}) = \sum_t \log N(o_t;\, o_{t-1}, \sigma^2), \qquad \sum_t \log N(o_t;\, \bar o, \sigma^2),
+.. math:: \log p(o_{1:T}) = \sum_t \log N(o_t;\, \bar o, \sigma^2), \qquad \sum_t \log N(o_t;\, o_{t-1}, \sigma^2),
 
-where :math:`o_0 = \bar o`. A model below them predicts worse than if nothing moved.
+where :math:`o_0 = \bar o`. For vectors also the linear prediction that fits the training split best,
+
+.. math:: \log p(o_{1:T}) = \sum_t \log N(o_t;\, A_1 o_{t-1} + A_2 o_{t-2} + B a_{t-1} + c,\, \sigma^2)
+
+and the previous observation for t ≤ 2. It predicts from positions and the velocities between them. A model below such a
+reference predicts worse than without a belief. Sequences of a known process are held against their exact log p instead.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import torch
 from torch import Tensor
 
-from forbes.data import SequenceDataModule, Split, Strokes
+from forbes.data import SequenceBatch, SequenceDataModule, Simulated, Split, Strokes
 from forbes.evaluation.ngram import fit_ngrams
-from forbes.models import Likelihood, Normal
+from forbes.models import Likelihood, Normal, SymlogNormal, VectorNormal
 from forbes.seeding import forked
 
 __all__ = ["lowest_above", "reference_means", "references"]
 
 _EXAMPLES, _ROWS = 500, 50
-"""Number of training sequences in the mean frame, and number of sequences decoded at a time."""
+"""Number of training sequences that are averaged and fitted, and number of sequences decoded at a time."""
+_NAMES = {3: ("mean frame", "last frame"), 1: ("mean observation", "last observation")}
+"""Names of the constant predictions by rank of the observation."""
 
 
 def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
@@ -29,9 +36,9 @@ def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, c
     if isinstance(data.source, Strokes):
         ngrams = fit_ngrams(data.source, data.length)
         return {f"{order}-gram": values for order, values in ngrams.log_prob(split, count).items()}
-    if isinstance(likelihood, Normal):
+    if isinstance(likelihood, Normal | VectorNormal | SymlogNormal) and not isinstance(data.source, Simulated):
         with forked("cpu", 0):  # for the dequantisation noise of coarse pixels
-            return _still_pictures(data, likelihood, split, count)
+            return _predictions(data, likelihood, split, count)
     return {}
 
 
@@ -48,18 +55,56 @@ def lowest_above(score: float, means: Mapping[str, float]) -> str | None:
 
 
 @torch.no_grad()
-def _still_pictures(data: SequenceDataModule, likelihood: Normal, split: Split, count: int) -> dict[str, Tensor]:
-    total, steps = torch.zeros(data.observation_shape, dtype=torch.float64), 0
-    for index in torch.arange(min(_EXAMPLES, data.source.size("train"))).split(_ROWS):
-        batch = data.sequences("train", index)
-        total += likelihood.target(batch.observation)[batch.mask].sum(0)
-        steps += int(batch.mask.sum())
-    mean = (total / max(steps, 1)).float()  # (C, H, W)
-    found: dict[str, list[Tensor]] = {"mean frame": [], "last frame": []}
+def _predictions(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
+    """Return log p of each step by the mean, by the previous observation, and of vectors by the best linear map."""
+    mean = _mean_target(data, likelihood)  # (*O)
+    weight = _least_squares(data, likelihood) if likelihood.rank == 1 else None  # (P, O)
+    found: dict[str, list[Tensor]] = {}
     for index in torch.arange(count).split(_ROWS):
         batch = data.sequences(split, index)
-        target = likelihood.target(batch.observation)  # (B, T, C, H, W)
-        before = torch.cat((mean.expand_as(target[:, :1]), target[:, :-1]), 1)  # (B, T, C, H, W)
-        for name, picture in (("mean frame", mean.expand_as(target)), ("last frame", before)):
-            found[name].append(likelihood.log_prob(picture, target).double() * batch.mask)
+        target = likelihood.target(batch.observation)  # (B, T, *O)
+        constant, last = _NAMES[likelihood.rank]
+        predicted = {constant: mean.expand_as(target), last: _delayed(target, mean)}
+        if weight is not None:
+            linear = (_regressors(target, batch.action) @ weight).to(target.dtype)  # (B, T - 2, O)
+            predicted["linear"] = torch.cat((predicted[last][:, :2], linear), 1)  # (B, T, O)
+        for name, output in predicted.items():
+            found.setdefault(name, []).append(likelihood.log_prob(output, target).double() * batch.mask)
     return {name: torch.cat(parts) for name, parts in found.items()}  # (N, T)
+
+
+def _train(data: SequenceDataModule) -> Iterator[SequenceBatch]:
+    for index in torch.arange(min(_EXAMPLES, data.source.size("train"))).split(_ROWS):
+        yield data.sequences("train", index)
+
+
+def _mean_target(data: SequenceDataModule, likelihood: Likelihood) -> Tensor:
+    """Return the mean over all steps of training sequences, `(*O)`."""
+    total, steps = torch.zeros(data.observation_shape, dtype=torch.float64), 0
+    for batch in _train(data):
+        total += likelihood.target(batch.observation)[batch.mask].sum(0)
+        steps += int(batch.mask.sum())
+    return (total / max(steps, 1)).float()  # (*O)
+
+
+def _least_squares(data: SequenceDataModule, likelihood: Likelihood) -> Tensor:
+    """Return (A_1, A_2, B, c) transposed, float64 `(P, O)`, by the normal equations of training sequences."""
+    products: list[Tensor] = []
+    for batch in _train(data):
+        target, mask = likelihood.target(batch.observation), batch.mask[:, 2:]  # (B, T, O), (B, T - 2)
+        known = _regressors(target, batch.action)[mask]  # (S, P)
+        products.append(known.T @ torch.cat((known, target[:, 2:][mask].double()), -1))  # (P, P + O)
+    both = torch.stack(products).sum(0)  # (P, P + O)
+    size = len(both)
+    return torch.linalg.lstsq(both[:, :size], both[:, size:], driver="gelsd").solution  # (P, O); of any rank
+
+
+def _regressors(target: Tensor, action: Tensor) -> Tensor:
+    """Return (o_{t-1}, o_{t-2}, a_{t-1}, 1) of each step from the third on, float64 `(B, T - 2, P)`."""
+    known = (target[:, 1:-1], target[:, :-2], action[:, 2:], torch.ones_like(target[:, 2:, :1]))
+    return torch.cat(known, -1).double()  # (B, T - 2, P)
+
+
+def _delayed(target: Tensor, mean: Tensor) -> Tensor:
+    """Return o_{t-1} of each step, the mean before the first, `(B, T, *O)`."""
+    return torch.cat((mean.expand_as(target[:, :1]), target[:, :-1]), 1)  # (B, T, *O)

@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Strokes
+from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Simulated, Strokes
 from forbes.evaluation.references import references
-from forbes.models import Bernoulli, Normal, OnePixel
+from forbes.models import Bernoulli, Normal, OnePixel, VectorNormal
+from forbes.pomdps import LinearGaussian
 
 
 class Films(SequenceSource):
@@ -32,6 +33,30 @@ class Films(SequenceSource):
         return SequenceBatch(compact, none[..., None][..., :0], none, mask, none[..., None][..., :0], ~mask)
 
 
+class Motions(SequenceSource):
+    """Positions of 40 training and 4 test trajectories under random forces, each with its own velocity."""
+
+    observation_shape = (2,)
+    action_dim = 2
+
+    def sha256(self):
+        return ""
+
+    def size(self, split):
+        return {"train": 40, "validation": 0, "test": 4}[split]
+
+    def gather(self, split, index, length):
+        draw = torch.Generator().manual_seed({"train": 0, "test": 1}[split])
+        return torch.randn(self.size(split), length, 2, generator=draw)[index]
+
+    def decode(self, compact):
+        force = torch.cat((torch.zeros_like(compact[:, :1]), compact[:, 1:]), 1)  # no action leads to the first
+        position = (compact[:, :1] + force.cumsum(1)).cumsum(1)
+        batch, time = compact.shape[:2]
+        none, mask = torch.zeros(batch, time), torch.ones(batch, time, dtype=torch.bool)
+        return SequenceBatch(position, force, none, mask, none[..., None][..., :0], ~mask)
+
+
 def test_strokes_have_n_grams_under_any_likelihood(strokes_file):
     data = SequenceDataModule(Strokes(path=str(strokes_file), validation=20), length=6)
 
@@ -55,6 +80,26 @@ def test_images_are_held_against_still_pictures():
             for name, picture in (("mean frame", mean), ("last frame", before)):
                 expected = likelihood.log_prob(picture, target).item() if test.mask[row, t] else 0
                 assert found[name][row, t].item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_vectors_of_a_linear_process_are_predicted_without_error():
+    data, likelihood = SequenceDataModule(Motions(), length=9), VectorNormal(std=0.1)
+
+    found = references(data, likelihood, "test", 4)
+
+    zero = likelihood.log_prob(torch.zeros(2), torch.zeros(2)).item()
+    target = data.sequences("test", torch.arange(4)).observation
+    torch.testing.assert_close(found["linear"][:, 2:], torch.full((4, 7), zero).double(), rtol=0, atol=1e-6)
+    last = likelihood.log_prob(target[:, :-1], target[:, 1:]).double()
+    torch.testing.assert_close(found["last observation"][:, 1:], last)
+    means = {name: values.sum(1).mean() for name, values in found.items()}
+    assert means["mean observation"] < means["last observation"] < means["linear"]
+
+
+def test_a_known_process_has_its_own_log_p():
+    data = SequenceDataModule(Simulated(LinearGaussian(), train=10, validation=2, test=2), length=5)
+
+    assert references(data, VectorNormal(), "test", 2) == {}
 
 
 def test_other_data_have_none():
