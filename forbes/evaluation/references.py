@@ -96,7 +96,8 @@ def _least_squares(data: SequenceDataModule, likelihood: Likelihood) -> Tensor:
         products.append(known.T @ torch.cat((known, target[:, 2:][mask].double()), -1))  # (P, P + O)
     both = torch.stack(products).sum(0)  # (P, P + O)
     size = len(both)
-    return torch.linalg.lstsq(both[:, :size], both[:, size:], driver="gelsd").solution  # (P, O); of any rank
+    weight: Tensor = torch.linalg.lstsq(both[:, :size], both[:, size:], driver="gelsd").solution  # (P, O); of any rank
+    return weight
 
 
 def _regressors(target: Tensor, action: Tensor) -> Tensor:
