@@ -124,7 +124,7 @@ def test_episodes_that_were_brought_back_are_sent_to_the_next_node(cluster, tmp_
     assert_same_run(run, straight)
     stored, expected = (EpisodeStore(folder / "episodes") for folder in (run, straight))
     assert stored.files() == expected.files() == [*range(3, 7)]
-    assert stored.damage() == {}
+    stored.verify(stored.files())
 
 
 def test_a_folder_that_another_process_holds_is_not_written_to(cluster, tiny_config, tmp_path):

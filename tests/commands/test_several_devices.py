@@ -216,10 +216,10 @@ def test_two_processes_evaluate_as_one(tiny_run, tmp_path):
     """Twelve sequences in three batches."""
     numbers = ["--samples", 2, "--particles", 4, "--futures", 4, "--context", 2, "--batch-size", 5]
     command = ["evaluate", tiny_run, "--scores", "elbo", "pll", "open-loop", *numbers, "--output"]
-    (status, out, _), other = finish(start_ranks("-m", "forbes", *command, tmp_path / "two"))
+    (status, out, err), other = finish(start_ranks("-m", "forbes", *command, tmp_path / "two"))
     assert main([*map(str, command), str(tmp_path / "one")]) == 0
 
-    assert status == 0
+    assert status == 0, err
     assert "elbo" in out
     assert other == (0, "", "")
     two, one = (tmp_path / name / Path(tiny_run).name for name in ("two", "one"))
