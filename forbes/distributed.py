@@ -7,16 +7,17 @@ nats. So inside `shared_batch`, losses are formed from sums over all ranks.
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-__all__ = ["WeightedMeans", "greatest", "masked_sums", "mean_over_ranks", "means_over_ranks", "num_ranks", "rank"]
-__all__ += ["shared_batch", "sum_over_ranks"]
+__all__ = ["WeightedMeans", "gathered", "greatest", "masked_sums", "mean_over_ranks"]
+__all__ += ["means_over_ranks", "num_ranks", "of_all_ranks", "rank", "shared_batch", "sum_over_ranks"]
 
+T = TypeVar("T")
 _shared = False
 
 
@@ -91,6 +92,24 @@ def greatest(number: int, device: torch.device) -> int:
     return int(found)
 
 
+def gathered(value: T) -> list[T]:
+    """Return the values with which all ranks call this, in the first rank; an empty list in the others."""
+    if num_ranks() == 1:
+        return [value]
+    found: list[Any] | None = [None] * num_ranks() if rank() == 0 else None
+    dist.gather_object(value, found)
+    return found or []
+
+
+def of_all_ranks(value: T) -> list[T]:
+    """Return the values with which all ranks call this, in all of them."""
+    found: list[Any] = [value]
+    if num_ranks() > 1:
+        found = [None] * num_ranks()
+        dist.all_gather_object(found, value)
+    return found
+
+
 class WeightedMeans:
     """Means of scalars over the batches of all ranks, which may differ in number and size. Their sums are float64."""
 
@@ -105,10 +124,7 @@ class WeightedMeans:
 
     def compute(self) -> dict[str, float]:
         """Return the mean of each value. All ranks must call this, also one that had no batch."""
-        of_ranks: list[Any] = [self._sums]
-        if num_ranks() > 1:
-            of_ranks = [None] * num_ranks()
-            dist.all_gather_object(of_ranks, self._sums)
+        of_ranks = of_all_ranks(self._sums)
         names = dict.fromkeys(name for sums in of_ranks for name in sums)
         totals = {name: [sums[name] for sums in of_ranks if name in sums] for name in names}
         return {name: sum(t for t, _ in found) / sum(w for _, w in found) for name, found in totals.items()}

@@ -42,6 +42,8 @@ def processes_of(folder, job):
 
 def sbatch(folder, script):
     text = Path(script).read_text()
+    if "--partition=none" in text:
+        sys.exit("sbatch: error: invalid partition specified: none\nsbatch: error: Batch job submission failed")
     number = 100 + len([*folder.glob("*.script")])
     (folder / f"{number}.script").write_text(text)
     array = re.search(r"--array=0-(\d+)", text)
@@ -77,7 +79,9 @@ def srun(folder, *arguments):
         path = path.replace("%A", str(number)).replace("%a", str(index))
         os.dup2(os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), stream)
     command = arguments[arguments.index("--error") + 2 :]
-    os.execv(command[0], command)
+    cpus = dict(option.lstrip("-").split("=") for option in command if option.startswith("--cpus"))
+    os.environ["SLURM_CPUS_PER_TASK"] = cpus.get("cpus-per-task", "1")  # that of the step, not of the job
+    os.execv(command[len(cpus)], command[len(cpus) :])
 
 
 def sacct(folder, *arguments):

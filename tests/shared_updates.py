@@ -15,9 +15,10 @@ from forbes.models import MLPDecoder, MLPEncoder, ParticleModel, VectorModel, Ve
 from forbes.pomdps import MirrorSensor
 from forbes.training import ImaginationActorCritic, KnownBelief, PlanningAgent, WorldModel
 
-__all__ = ["BATCH", "KINDS", "STEPS", "TRAJECTORIES", "train"]
+__all__ = ["ACCUMULATED", "BATCH", "KINDS", "MICRO_BATCHES", "STEPS", "TRAJECTORIES", "train"]
 
 BATCH, STEPS, TRAJECTORIES, UPDATES = 14, 5, 3, 3
+ACCUMULATED, MICRO_BATCHES = "accumulated", 2
 WORLD = {
     "belief": GaussianBelief,
     "encoder": partial(MLPEncoder, width=6, layers=1),
@@ -38,6 +39,7 @@ KINDS = {
     "FORBES": partial(WorldModel, **FLOW, kl="monte_carlo"),
     "much below its free nats": partial(WorldModel, free_nats=50.0),
     "not finite in one row": partial(WorldModel),
+    ACCUMULATED: partial(WorldModel, **FLOW, kl="monte_carlo", center=False, free_nats=0),
     "free nats of each step": partial(WorldModel, free_nats_per="element"),
     "categorical": partial(WorldModel, belief=partial(CategoricalBelief, classes=3)),
     "particles": partial(WorldModel, model=partial(ParticleModel, particles=TRAJECTORIES)),
@@ -58,12 +60,12 @@ class Double(VectorNormal):
 
 
 class Unequal(SequenceSource):
-    """Random sequences: those of the first half of a batch are much shorter, and larger, than the others."""
+    """Random sequences: those of the first half of a batch are larger, and much shorter unless `whole`, than others."""
 
     observation_shape, action_dim = (2,), 2
 
-    def __init__(self, broken_row=None):
-        self.broken_row = broken_row
+    def __init__(self, broken_row=None, whole=False):
+        self.broken_row, self.whole = broken_row, whole
 
     def sha256(self):
         return ""
@@ -72,7 +74,7 @@ class Unequal(SequenceSource):
         return 9 * BATCH
 
     def train_index(self, batch_size, length, seed, update):
-        return update * BATCH + torch.arange(BATCH)
+        return update * batch_size + torch.arange(batch_size)
 
     def gather(self, split, index, length):
         rows = [torch.Generator().manual_seed(row) for row in index.tolist()]
@@ -85,7 +87,7 @@ class Unequal(SequenceSource):
     def decode(self, compact):
         numbers, row = compact
         short = row < BATCH // 2
-        steps = torch.where(short, 1 + row % 2, numbers.shape[1])  # (B,)
+        steps = torch.where(short & (not self.whole), 1 + row % 2, numbers.shape[1])  # (B,)
         mask = torch.arange(numbers.shape[1]) < steps[:, None]  # (B, T)
         observation, action, reward, state = numbers.split((2, 2, 1, 1), -1)
         scale = 1 + 2 * short[:, None, None]  # (B, 1, 1)
@@ -110,6 +112,8 @@ class Recorder(Callback):
         self.gradients = {n: p.grad.clone() for n, p in pl_module.named_parameters() if p.grad is not None}
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        if (batch_idx + 1) % trainer.accumulate_grad_batches:
+            return
         row = {name: value.double() for name, value in trainer.callback_metrics.items() if name.startswith("train")}
         self.rows.append({**row, "loss": outputs["loss"].detach(), **self.gradients})
 
@@ -121,20 +125,30 @@ def build(kind):
     return KINDS[kind](**{**WORLD, "likelihood": Double(), **KINDS[kind].keywords}).double()
 
 
-def train(kind, ranks):
-    """Return what the updates gave, the validation's metrics, and the weights in the end."""
+def train(kind, ranks, at_once=False):
+    """Return what the updates gave, the validation's metrics, and the weights in the end.
+
+    The micro-batches of an accumulated update are one batch if they come `at_once`.
+    """
+    micro = MICRO_BATCHES if kind == ACCUMULATED else 1
     known, broken = kind == "known process", 2 * BATCH - 1 if kind == "not finite in one row" else None
     torch.set_default_dtype(torch.float32 if known else torch.float64)  # that of what is logged, too
     try:
-        source = Simulated(MirrorSensor(), train=9 * BATCH, validation=9 * BATCH) if known else Unequal(broken)
+        source = (
+            Simulated(MirrorSensor(), train=9 * BATCH, validation=9 * BATCH)
+            if known
+            else Unequal(broken, whole=micro > 1)
+        )
         kind_of_data = SequenceDataModule if known else DoubleBatches
-        data = kind_of_data(source, BATCH, STEPS, UPDATES, validation_sequences=9 * BATCH)
+        batch_size, batches = (micro * BATCH, UPDATES) if at_once else (BATCH, micro * UPDATES)
+        data = kind_of_data(source, batch_size, STEPS, batches, validation_sequences=9 * BATCH)
         module, recorder = build(kind), Recorder()
         trainer = Trainer(
             accelerator="cpu",
             devices=ranks,
             strategy="ddp" if ranks > 1 else "auto",
             max_epochs=1,
+            accumulate_grad_batches=1 if at_once else micro,
             num_sanity_val_steps=0,
             log_every_n_steps=1,
             logger=False,

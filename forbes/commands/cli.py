@@ -124,7 +124,8 @@ def _run(arguments: list[str]) -> int:
             print(page, end="")
             return 0
     else:  # help and wrong arguments are reported before anything heavy is imported
-        _require_one_process(name)
+        if name != "evaluate":
+            _require_one_process(name)
         _parser(name).parse_args(list(itertools.takewhile("--".__ne__, rest)))
     module, function = COMMANDS[name].target.split(":")
     command: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)

@@ -1,9 +1,11 @@
 """`forbes evaluate`: bounds and proper scores of trained models, with paired differences."""
 
+import io
 import itertools
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +41,7 @@ from forbes.evaluation.runs import (
 )
 from forbes.evaluation.scoring import PartialScores, Scorer, exact_scorer, make_scorer, score_split, with_progress
 from forbes.runs.folder import RunFolder
+from forbes.runs.launched import connected, is_first, num_from_torchrun
 from forbes.runs.provenance import command_line, commit, origin
 
 __all__ = ["WantedMetrics", "evaluate", "main", "wanted_metrics"]
@@ -56,7 +59,12 @@ class _Job(NamedTuple):
 
 
 def main(argv: Sequence[str]) -> None:
-    """Run the command with its arguments."""
+    """Run the command with its arguments. Of several processes, the first prints and records the results."""
+    with redirect_stdout(sys.stdout if is_first() else io.StringIO()):
+        _main(argv)
+
+
+def _main(argv: Sequence[str]) -> None:
     args = parser().parse_args(argv)
     command = command_line("evaluate", *argv)
     if args.checkpoint is not None:
@@ -68,6 +76,8 @@ def main(argv: Sequence[str]) -> None:
     if args.runs and is_agent(args.runs[0]):
         if args.model:
             raise ForbesError(f"{args.runs[0]}: an agent is evaluated by its return, a --model has none. Name others")
+        if num_from_torchrun() > 1:
+            raise ForbesError(f"{args.runs[0]}: one process plays the episodes of an agent. Leave torchrun out")
         device = find_device(args.device)
         played = evaluate_agents(folders, args.episodes, args.acting_samples, args.seed, device, command)
         return print_agents(played)
@@ -77,6 +87,8 @@ def main(argv: Sequence[str]) -> None:
     require_readable(folders.values())
     runs = load_all(args.runs, args.model, args.data, find_device(args.device))
     measured = evaluate(runs, args, command, folders)
+    if not is_first():
+        return
     print_runs(measured)
     print_references(measured)
     if len(measured) > 1:
@@ -93,28 +105,33 @@ def evaluate(runs: Sequence[TrainedRun], args: Any, command: str, folders: Mappi
         args: parsed options of `forbes.commands.parsers.evaluate.add_score_options`.
         command: command line, for the record.
         folders: folder for the record of each run, by its path.
+
+    Returns:
+        The runs with their scores; nothing in processes other than the first.
     """
     jobs, code = _jobs(args, runs), commit()
-    finished: list[PartialScores] = []
-    measured = []
-    for number, run in enumerate(runs):
-        evaluated = EvaluatedRun(run, {}, {})
-        for job in _of(run, jobs):
-            parts = PartialScores(folders[run.path] / "evaluation-parts", code, *_key(run, job, number, args))
-            _measure(evaluated, job, job.sha256[number], args, parts)
-            finished.append(parts)
+    saved: list[PartialScores] = []
+    measured = [EvaluatedRun(run, {}, {}) for run in runs]
+    with connected():
+        for number, evaluated in enumerate(measured):
+            for job in _of(evaluated.run, jobs):
+                folder, key = folders[evaluated.run.path], _key(evaluated.run, job, number, args)
+                saved.append(PartialScores(folder / "evaluation-parts", code, *key))
+                _measure(evaluated, job, job.sha256[number], args, saved[-1])
+    if not is_first():
+        return []
+    about = origin(command, args.seed)
+    for number, evaluated in enumerate(measured):
         _add_references(evaluated, jobs, args.split)
-        evaluated = evaluated._replace(images=_image_entries(run, jobs, number, args))
-        about = origin(command, args.seed) | {"parameters": run.parameters}
-        for entry in (*evaluated.entries.values(), *evaluated.images.values()):
-            entry.update(about)
-        measured.append(evaluated)
+        measured[number] = evaluated._replace(images=_image_entries(evaluated.run, jobs, number, args))
+        for entry in (*evaluated.entries.values(), *measured[number].images.values()):
+            entry.update(about | {"parameters": evaluated.run.parameters})
     for first, second, differences in compare_pairs(measured):
         record_differences(first, second, differences)
     for evaluated in measured:
         entries = {**evaluated.entries, **evaluated.images, **_round_trip(evaluated.run, args)}
         write_record(folders[evaluated.run.path], entries, evaluated.totals)
-    for parts in finished:
+    for parts in saved:
         parts.remove()
     return measured
 
@@ -278,7 +295,7 @@ def _measure(evaluated: EvaluatedRun, job: _Job, sha256: str, args: Any, parts: 
     began = time.monotonic()
     batches = split_batches(run.data, args.split, job.sequences, score.batch_size)
     batches = with_progress(batches, f"{run.path} {job.name}", job.sequences)
-    scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts)
+    scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts, per_rank=True)
     for metric in score.metrics:
         name = _metric_name(run, job, metric, args.split)
         evaluated.totals[name] = scores.total(metric)

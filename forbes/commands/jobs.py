@@ -11,6 +11,7 @@ from types import FrameType
 from typing import NamedTuple, NoReturn, Protocol
 
 from forbes.commands.board import Board
+from forbes.errors import ForbesError
 from forbes.runs.folder import RunFolder
 from forbes.runs.signals import STOPPED
 
@@ -82,6 +83,9 @@ class Launcher(Protocol):
         Args:
             job: job to run.
             say: function that shows a line of its output.
+
+        Raises:
+            ForbesError: if it cannot be run. It ends like a job with status 2, and the others go on.
         """
 
     def stop(self) -> None:
@@ -147,7 +151,11 @@ class _Running:
         attempts = 0
         while True:
             before = checkpoint_time(job)
-            status = self.launcher.attempt(job, lambda line: self.board.say(job.name, line))
+            try:
+                status = self.launcher.attempt(job, lambda line: self.board.say(job.name, line))
+            except ForbesError as error:
+                self.board.say(job.name, f"forbes: {error}")
+                status = 2
             attempts = attempts + 1 if checkpoint_time(job) == before else 1
             if status in _FINAL or attempts == ATTEMPTS or self.stopping.is_set():
                 return status, attempts

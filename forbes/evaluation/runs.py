@@ -79,12 +79,14 @@ def find_device(name: str) -> str:
     """Return the name of a usable device.
 
     Args:
-        name: "auto" (CUDA if available), or a torch device.
+        name: "auto" (CUDA if available, in several processes a GPU for each), or a torch device.
 
     Raises:
         ForbesError: if the device cannot be used.
     """
     chosen = ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+    if name == "auto" and chosen == "cuda" and "LOCAL_RANK" in os.environ:
+        chosen = f"cuda:{int(os.environ['LOCAL_RANK']) % torch.cuda.device_count()}"
     try:
         torch.zeros(1, dtype=torch.float64, device=chosen)
     # Unknown name, no CUDA, and no float64, in this order.

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import itertools
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from forbes.choices import PASSES, SUBSET
 from forbes.data import SequenceBatch, SequenceDataModule, Split
+from forbes.distributed import num_ranks, of_all_ranks, rank
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import split_batches
@@ -221,6 +223,7 @@ def score_split(
     seed: int = 0,
     where: str = "the model",
     parts: PartialScores | None = None,
+    per_rank: bool = False,
 ) -> Scores:
     """Score every sequence.
 
@@ -231,13 +234,15 @@ def score_split(
         seed: random seed for the noise, which depends on nothing else but the batches.
         where: name of the model and the split, for error messages.
         parts: scores saved by an interrupted evaluation; new ones are saved there too.
+        per_rank: whether all ranks call this, and share the batches out. Each gets all scores.
 
     Raises:
         ForbesError: if a score is not finite (names the sequence), or if the memory does not suffice for one sequence.
     """
     device = next(model.parameters()).device
-    found: list[Scores] = []
-    for first, batch in batches:
+    of_rank: dict[int, Scores] = {}  # by the index of the first sequence
+    mine = itertools.islice(batches, rank(), None, num_ranks()) if per_rank else batches
+    for first, batch in mine:
         values = parts.read(first) if parts else None
         if values is None:
             values = _score(model, first, batch.to(device), score, seed, where)
@@ -246,7 +251,9 @@ def score_split(
                 parts.write(first, values)
         scored = batch.mask.clone()  # (B, T)
         scored[:, : score.context] = False
-        found.append(Scores(values, scored))
+        of_rank[first] = Scores(values, scored)
+    by_first = {k: v for scores in (of_all_ranks(of_rank) if per_rank else [of_rank]) for k, v in scores.items()}
+    found = [by_first[first] for first in sorted(by_first)]
     merged = {name: torch.cat([scores.values[name] for scores in found]) for name in score.metrics}  # (N, T)
     return Scores(merged, torch.cat([scores.mask for scores in found]))
 
@@ -291,7 +298,10 @@ def require_finite(where: str, first: int, scores: Increments) -> None:
 def with_progress(
     batches: Iterator[tuple[int, SequenceBatch]], name: str, sequences: int
 ) -> Iterator[tuple[int, SequenceBatch]]:
-    """Yield the batches and show progress: a bar on a terminal, elsewhere a line per tenth."""
+    """Yield the batches and show progress, in the first rank: a bar on a terminal, elsewhere a line per tenth."""
+    if rank() > 0:
+        yield from batches
+        return
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(escape(name), total=sequences)

@@ -1,4 +1,4 @@
-"""The processes (ranks) of one training: who started them, what they agree on, and how they end together.
+"""The processes (ranks) of one training or evaluation: who started them, what they agree on, how they end together.
 
 `--trainer.devices N` lets Lightning start the others from this one, with the same command line. `torchrun` and SLURM
 start all of them.
@@ -8,7 +8,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch.distributed as dist
@@ -19,7 +20,15 @@ from lightning.pytorch.utilities import rank_zero_only
 from forbes.errors import ForbesError
 from forbes.runs.folder import RunFolder
 
-__all__ = ["EndTogether", "chosen_by_first", "is_first", "launched_devices", "lost_process"]
+__all__ = [
+    "EndTogether",
+    "chosen_by_first",
+    "connected",
+    "is_first",
+    "launched_devices",
+    "lost_process",
+    "num_from_torchrun",
+]
 
 _RUN = "FORBES_RUN_FOLDER"
 _GRACE = 5.0
@@ -73,6 +82,32 @@ def chosen_by_first(choose: Callable[[], str]) -> str:
     if is_first():
         os.environ[_RUN] = choose()  # Lightning starts the others with this environment
     return os.environ[_RUN]
+
+
+def num_from_torchrun() -> int:
+    """Return the number of processes that torchrun started, of which this is one; 1 without torchrun."""
+    return int(os.environ["WORLD_SIZE"]) if TorchElasticEnvironment.detect() else 1
+
+
+@contextmanager
+def connected() -> Iterator[None]:
+    """Connect the processes that torchrun has started, if it has, for a command without Lightning's Trainer.
+
+    Raises:
+        ForbesError: if one of them ends.
+    """
+    if num_from_torchrun() == 1:
+        yield
+        return
+    dist.init_process_group("gloo")
+    try:
+        yield
+    except RuntimeError as error:
+        if not lost_process(error):
+            raise
+        raise ForbesError("a process of this command has ended, so all end. Repeat it to continue") from error
+    finally:
+        dist.destroy_process_group()
 
 
 def lost_process(error: BaseException) -> bool:

@@ -38,6 +38,32 @@ def test_each_epoch_adds_one_episode_to_the_seed_episodes(run):
     assert len({record.seed for record in records}) == 4
 
 
+def test_several_episodes_an_epoch_are_kept_for_both_checkpoints(tmp_path, monkeypatch):
+    """Two of the parrot's 8 steps fit, two more are those of the previous checkpoint; a kill changes nothing."""
+    config = write_config(tmp_path)
+    config.write_text(config.read_text().replace("{seed_episodes: 2", "{episodes: 2, seed_episodes: 2"))
+    fit_it = ("--config", config, "--data.source.capacity", 16, "--run_dir")
+
+    def kill(self, loss):
+        if self.global_step == 10:
+            raise Killed
+
+    assert fit(*fit_it, tmp_path / "whole") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(ImaginationActorCritic, "on_before_backward", kill)
+        with pytest.raises(Killed):
+            fit(*fit_it, tmp_path / "cut")
+    assert fit("--resume", tmp_path / "cut") == 0
+
+    metrics = read_metrics(tmp_path / "whole")
+    assert metrics["agent_steps"].dropna().tolist() == [16, 32, 48]
+    records = EpisodeStore(tmp_path / "whole" / "episodes").records
+    assert [*records] == [0, 1, 2, 3, 4, 5]
+    newest = [records[number].total_reward for number in (4, 5)]
+    assert metrics["return/exploring"].dropna().iloc[-1] == pytest.approx(sum(newest) / 2, rel=1e-6)
+    pd.testing.assert_frame_equal(read_metrics(tmp_path / "cut"), metrics, check_exact=True)
+
+
 def test_trainings_of_different_seeds_see_different_episodes(run, tmp_path):
     assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run", "--seed_everything", "1") == 0
 
@@ -446,6 +472,11 @@ def test_a_finished_run_can_be_made_longer(run, tmp_path):
         (("Parrot", "Parot"), "Parot: no such task. Did you mean Parrot?"),
         (("steps: 8", "length: 8"), "Parrot: its environment has no option length"),
         (("seed_episodes: 2", "seed_episodes: 0"), "Collect: seed_episodes is 0, expected at least 1"),
+        (
+            ("{seed", "{overlap: true, episodes: 2, seed"),
+            "Collect: overlap plays one episode at a time, found episodes 2",
+        ),
+        (("{seed", "{overlap: true, per_rank: true, seed"), "overlap plays one episode at a time, found per_rank"),
         (("class_path: ImaginationActorCritic", "class_path: WorldModel"), "Collect: found a WorldModel on Experience"),
         (("horizon: 3", "model: VectorModel"), "its model is a VectorModel, expected a StateSpaceModel"),
     ],

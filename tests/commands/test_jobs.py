@@ -14,6 +14,8 @@ from forbes.commands.cli import main
 from forbes.commands.jobs import Job, run_jobs
 from forbes.commands.launchers import process
 from forbes.commands.launchers.local import Local
+from forbes.commands.trainings import failures
+from forbes.errors import ForbesError
 
 
 def python(name, code, *arguments, **options):
@@ -132,9 +134,11 @@ def test_a_job_that_crashes_three_times_is_given_up(tmp_path, capsys):
     bad, good = run_jobs(jobs, Local(1))
 
     assert (tmp_path / "attempts").read_text() == "xxx"
-    assert bad.reason == "ended 3 times with status 1: ValueError: no luck"
+    assert failures([bad, good]) == {"bad": "ended 3 times with status 1: ValueError: no luck"}
     assert good.status == 0
-    assert "bad: ended with status 1, begins again (attempt 3)" in capsys.readouterr().out.splitlines()
+    lines = capsys.readouterr().out.splitlines()
+    assert "bad: ended with status 1, begins again (attempt 3)" in lines
+    assert "not finished: bad ended 3 times with status 1: ValueError: no luck" in lines
 
 
 def test_a_crash_after_a_new_checkpoint_is_the_first_again(tmp_path):
@@ -172,6 +176,19 @@ def test_a_refused_job_is_not_run_and_says_why(tmp_path, capsys):
     assert bad.reason == "has another configuration"
     assert good.status == 0
     assert "it ran" not in capsys.readouterr().out
+
+
+def test_a_job_that_cannot_be_begun_stops_no_other():
+    class Refusing(Local):
+        def attempt(self, job, say):
+            if job.name == "bad":
+                raise ForbesError("runs/bad: another process trains here")
+            return super().attempt(job, say)
+
+    bad, good = run_jobs([python("bad", "pass"), python("good", "pass")], Refusing(1))
+
+    assert bad.reason == "ended with status 2: forbes: runs/bad: another process trains here"
+    assert good.status == 0
 
 
 STUBBORN = """

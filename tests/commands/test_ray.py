@@ -8,13 +8,16 @@ import sys
 from pathlib import Path
 
 import pytest
+import small_agents
 from command_line import error_of
 from continued_runs import assert_same_run, starts
 
 import forbes
 from forbes.commands.cli import main
-from forbes.commands.jobs import run_jobs
+from forbes.commands.jobs import Job, run_jobs
 from forbes.commands.trainings import Training, training_job
+from forbes.data.episodes.store import EpisodeStore
+from forbes.errors import ForbesError
 from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder
 
@@ -106,6 +109,48 @@ def test_a_job_continues_elsewhere_to_the_same_bits(lost, shared, cluster, strai
     assert_same_run(run, straight)
 
 
+def test_episodes_that_were_brought_back_are_sent_to_the_next_node(cluster, tmp_path):
+    """The memory holds two episodes of 75 steps, so that others are deleted meanwhile."""
+    config, hike = small_agents.write_config(tmp_path), ("--data.source.task", "mountain_hike")
+    flags = (*hike, "--data.source.options", "{}", "--data.source.capacity", "200", "--trainer.max_epochs", "6")
+    straight, run = tmp_path / "straight", tmp_path / "watched"
+    assert main(["fit", "--config", str(config), *flags, "--run_dir", str(straight)]) == 0
+    launcher = Watched(tmp_path, cluster.address, 1, 0.0, 4, strike=kill_worker, shared=False)
+
+    (ended,) = run_jobs([training_job(Training(str(config), flags, 0, str(run)))], launcher)
+
+    assert (ended.status, launcher.strike) == (0, None)
+    assert starts(run)[1] > 0
+    assert_same_run(run, straight)
+    stored, expected = (EpisodeStore(folder / "episodes") for folder in (run, straight))
+    assert stored.files() == expected.files() == [*range(3, 7)]
+    stored.verify(stored.files())
+
+
+def test_a_folder_that_another_process_holds_is_not_written_to(cluster, tiny_config, tmp_path):
+    """Nor is it seen by the node, which does not share it."""
+    jobs = [training_job(Training(str(tiny_config), EPOCHS, 0, str(tmp_path / name))) for name in ("held", "free")]
+    launcher = Watched(tmp_path, cluster.address, 1, 0.0, 4, strike=None, shared=False)
+
+    with RunFolder(tmp_path / "held").locked():
+        held, free = run_jobs(jobs, launcher)
+
+    assert held.reason.startswith(f"ended with status 2: forbes: {tmp_path}/held: process {os.getpid()} on ")
+    assert free.status == 0
+    assert not (tmp_path / "held" / "metrics.jsonl").exists()
+
+
+def test_jobs_share_a_gpu(head, tmp_path):
+    """Four at most have a quarter of one each, and see it under its number."""
+    node = head.add_node(num_cpus=2, num_gpus=1)
+    job = ["-c", "import os; print('GPU', os.environ['CUDA_VISIBLE_DEVICES'])"]
+
+    ended = run_jobs([Job(name, job) for name in "ab"], Ray(tmp_path, head.address, 1, 0.25, 4))
+    head.remove_node(node)
+
+    assert [(one.status, one.last) for one in ended] == [(0, "GPU 0")] * 2
+
+
 def test_an_interrupt_stops_the_job_with_a_checkpoint(cluster, straight, tiny_config, tmp_path):
     run, job = tmp_path / "run", Training(str(tiny_config), EPOCHS, 0, str(tmp_path / "run"))
 
@@ -135,6 +180,16 @@ def test_the_same_command_continues_after_its_driver_was_killed(cluster, straigh
     assert again.returncode == 0, again.stderr
     assert len(starts(tmp_path / "forbes-0")) == 2
     assert_same_run(tmp_path / "forbes-0", straight)
+
+
+def test_a_cluster_of_another_version_is_refused_with_the_reason(tmp_path, monkeypatch):
+    def mismatch(**options):
+        raise RuntimeError("Version mismatch:\n  The cluster has 2.9")
+
+    monkeypatch.setattr(ray, "init", mismatch)
+
+    with pytest.raises(ForbesError, match=r"cannot be joined \(Version mismatch: The cluster has 2.9\)"):
+        run_jobs([Job("one", ["-c", "pass"])], Ray(tmp_path, "auto", 1, 0.0, 1))
 
 
 def test_without_a_cluster_it_says_how_to_start_one(tiny_config, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """One training in several processes: one run, which ends and resumes like that of one process."""
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -7,9 +8,12 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
+import pandas as pd
 import pytest
 import small_agents
 from command_line import error_of
+from continued_runs import assert_same_run
 from ranks import TIMEOUT, environment, finish, start_ranks
 
 from forbes.callbacks import CudaGraph
@@ -17,6 +21,7 @@ from forbes.commands.cli import main
 from forbes.data import SequenceDataModule
 from forbes.data.episodes.store import EpisodeStore
 from forbes.errors import ForbesError
+from forbes.evaluation.record import read_arrays, read_record
 from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder, read_config, read_metrics
 from forbes.runs.launched import chosen_by_first, launched_devices
@@ -103,7 +108,8 @@ def test_a_signal_to_one_process_stops_all_with_a_checkpoint(tiny_config, in_tmp
     assert read_config(run.config)["trainer"]["devices"] == 2
 
 
-def test_a_process_that_dies_ends_all_with_a_sentence(tiny_config, in_tmp_path):
+def test_a_process_that_dies_ends_all_and_they_resume_on_any_number(tiny_config, in_tmp_path, monkeypatch):
+    """On two, to the bits of a training that was never stopped; on one, with the same batches, but other noise."""
     arguments = ["--config", tiny_config, "--trainer.devices", 2, "--trainer.max_epochs", 1000]
     process = start("-m", "forbes", "fit", *arguments, cwd=in_tmp_path)
     wait_for("runs/*/*/*/checkpoints/last.ckpt", in_tmp_path)
@@ -114,9 +120,22 @@ def test_a_process_that_dies_ends_all_with_a_sentence(tiny_config, in_tmp_path):
     assert status == 2
     remedy = f"Resume from its last checkpoint: forbes fit --resume {run}"
     assert err == f"forbes: {run}: a process of this training has ended, so all end. {remedy}\n"
-    assert read_checkpoint(run.checkpoint)["global_step"] % 5 == 0
-    with run.locked():
-        pass
+    updates = read_checkpoint(run.checkpoint)["global_step"]
+    assert updates % 5 == 0
+
+    alone, straight = shutil.copytree(run.path, in_tmp_path / "alone"), in_tmp_path / "straight"
+    length = ["--trainer.max_epochs", updates // 5 + 1]
+    resumed = start("-m", "forbes", "fit", "--resume", run, *length, cwd=in_tmp_path)
+    never_stopped = start("-m", "forbes", "fit", *arguments, *length, "--run_dir", straight, cwd=in_tmp_path)
+    assert [status for status, *_ in finish([resumed, never_stopped])] == [0, 0]
+    assert_same_run(run.path, straight)
+
+    numbers, train_index = [], SequenceDataModule.train_index
+    monkeypatch.setattr(SequenceDataModule, "train_index", lambda self, n: numbers.append(n) or train_index(self, n))
+    assert main(["fit", "--resume", str(alone), *map(str, length), "--trainer.devices", "1"]) == 0
+    assert numbers == [*range(updates, updates + 5)]
+    before = read_metrics(straight).loc[:updates]
+    pd.testing.assert_frame_equal(read_metrics(alone).loc[:updates], before, check_exact=True)
 
 
 def test_one_process_collects_the_episodes_of_all(tmp_path):
@@ -136,6 +155,29 @@ def test_one_process_collects_the_episodes_of_all(tmp_path):
     assert {*metrics} == {*alone}
     for name in ("env_steps", "agent_steps"):
         assert metrics[name].dropna().tolist() == alone[name].dropna().tolist()
+
+
+def hashes(run):
+    return [record.sha256 for record in EpisodeStore(run / "episodes").records.values()]
+
+
+def test_processes_that_share_the_episodes_out_store_those_of_one(tmp_path):
+    """Two seed episodes and three an epoch, by an agent that does not change; the last epoch is resumed by one."""
+    config, two, one = small_agents.write_config(tmp_path), tmp_path / "two", tmp_path / "one"
+    config.write_text(config.read_text().replace("{seed_episodes: 2", "{episodes: 3, per_rank: true, seed_episodes: 2"))
+    rates = [f"--model.{name}=0" for name in ("learning_rate", "actor_rate", "critic_rate")]
+    fit = ["fit", "--config", config, "--data.batch_size", 4, *rates]
+    on_two = [*fit, "--run_dir", two, "--trainer.max_epochs", 2]
+
+    assert finish(start_ranks("-m", "forbes", "--allow-module", "toy_environments", *on_two))[1] == (0, "", "")
+    assert len(hashes(two)) == 5
+    assert small_agents.forbes("fit", "--resume", two, "--trainer.max_epochs", 3, "--trainer.devices", 1) == 0
+    assert small_agents.forbes(*fit, "--run_dir", one) == 0
+
+    assert hashes(two) == hashes(one)
+    assert len({*hashes(one)}) == 8
+    for name in ("env_steps", "return/exploring"):
+        assert read_metrics(two)[name].dropna().tolist() == read_metrics(one)[name].dropna().tolist()
 
 
 @pytest.mark.parametrize(
@@ -165,9 +207,29 @@ def test_what_is_not_a_training_uses_one_process(monkeypatch, capsys):
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "test")
     monkeypatch.setenv("WORLD_SIZE", "2")
 
-    assert error_of(capsys, "evaluate", "runs/any").startswith(
-        "forbes evaluate: uses one process, but torchrun started 2"
+    assert error_of(capsys, "beliefs", "runs/any").startswith(
+        "forbes beliefs: uses one process, but torchrun started 2"
     )
+
+
+def test_two_processes_evaluate_as_one(tiny_run, tmp_path):
+    """Twelve sequences in three batches."""
+    numbers = ["--samples", 2, "--particles", 4, "--futures", 4, "--context", 2, "--batch-size", 5]
+    command = ["evaluate", tiny_run, "--scores", "elbo", "pll", "open-loop", *numbers, "--output"]
+    (status, out, err), other = finish(start_ranks("-m", "forbes", *command, tmp_path / "two"))
+    assert main([*map(str, command), str(tmp_path / "one")]) == 0
+
+    assert status == 0, err
+    assert "elbo" in out
+    assert other == (0, "", "")
+    two, one = (tmp_path / name / Path(tiny_run).name for name in ("two", "one"))
+    scores, expected = read_arrays(two), read_arrays(one)
+    assert [*scores] == [*expected]
+    for name in expected:
+        np.testing.assert_array_equal(scores[name], expected[name])
+    entries, alone = read_record(two), read_record(one)
+    assert [*entries] == [*alone]
+    assert [entry.get("mean") for entry in entries.values()] == [entry.get("mean") for entry in alone.values()]
 
 
 def test_slurm_says_how_many_processes_there_are(monkeypatch):

@@ -13,6 +13,7 @@ from continued_runs import assert_same_run, starts
 from forbes.commands.cli import main
 from forbes.commands.jobs import Job, run_jobs
 from forbes.commands.trainings import Training, training_job
+from forbes.errors import ForbesError
 
 submitit = pytest.importorskip("submitit")
 
@@ -105,12 +106,15 @@ def jobs_of(tiny_config, tmp_path):
     return [training_job(training) for training in trainings]
 
 
-def test_an_array_with_the_options_survives_a_preemption(cluster, straight, tiny_config, tmp_path):
-    """SLURM sends SIGTERM, then the announced signal, to all processes of a job."""
+@pytest.mark.parametrize(
+    ("signals", "submitted"), [((signal.SIGTERM, signal.SIGUSR2), 1), ((signal.SIGTERM,), 2)], ids=["both", "SIGTERM"]
+)
+def test_an_array_with_the_options_survives_a_preemption(signals, submitted, cluster, straight, tiny_config, tmp_path):
+    """SLURM sends SIGTERM to all processes of a job, and if it is set up so the announced signal."""
 
     def preempt(handle):
         processes = fake_slurm.processes_of(cluster, handle.job_id)
-        for number in (signal.SIGTERM, signal.SIGUSR2):
+        for number in signals:
             for process in processes:
                 os.kill(process, number)
 
@@ -120,11 +124,29 @@ def test_an_array_with_the_options_survives_a_preemption(cluster, straight, tiny
     ended = run_jobs(jobs_of(tiny_config, tmp_path)[:1], launcher)
 
     assert [one.status for one in ended] == [0]
-    (script,) = fake_slurm.submissions(cluster)
+    script, *again = fake_slurm.submissions(cluster)
+    assert 1 + len(again) == submitted
     wanted = ("partition=gpu", "time=240", "gpus-per-node=1", "mem=16G", "requeue", "signal=USR2@120")
     assert not [option for option in wanted if f"#SBATCH --{option}\n" not in script]
     assert len(starts(tmp_path / "run-0")) == 2
     assert_same_run(tmp_path / "run-0", straight)
+
+
+@pytest.mark.parametrize(("options", "threads"), [([], "1"), (["cpus-per-task=3"], "3")])
+def test_a_job_has_the_cpus_that_were_asked_for(options, threads, cluster, tmp_path, monkeypatch):
+    """Since SLURM 22.05, srun does not take their number from sbatch."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    jobs = [Job("one", ["-c", "import os; print(os.environ['OMP_NUM_THREADS'])"])]
+
+    (ended,) = run_jobs(jobs, Slurm(tmp_path, options, 1))
+
+    assert (ended.status, ended.last) == (0, threads)
+
+
+def test_jobs_that_slurm_refuses_are_said_with_its_reason(cluster, tmp_path):
+    refused = r"SLURM refuses the jobs \(sbatch: error: invalid partition specified: none\). Change --slurm"
+    with pytest.raises(ForbesError, match=refused):
+        run_jobs([Job("one", ["-c", "pass"])], Slurm(tmp_path, ["partition=none"], 1))
 
 
 def test_a_second_command_waits_for_the_jobs_of_the_first(cluster, straight, tiny_config, tmp_path):

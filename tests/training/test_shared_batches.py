@@ -4,7 +4,7 @@ import pytest
 import shared_updates
 import torch
 from ranks import finish, start_ranks
-from shared_updates import BATCH, KINDS, STEPS, TRAJECTORIES, train
+from shared_updates import ACCUMULATED, BATCH, KINDS, STEPS, TRAJECTORIES, train
 from torch.overrides import TorchFunctionMode
 
 from forbes.seeding import derive_seed
@@ -15,13 +15,8 @@ pytestmark = [
     pytest.mark.filterwarnings(f"ignore:.*{text}")
     for text in ("LeafSpec", "does not have many workers", "`IterableDataset` has", "dataloader is not resumable")
 ]
-ROWS = {  # sizes of axes that have a row for each sequence, and what is flattened with it: before and after it
-    BATCH: (1, 1),
-    BATCH * STEPS: (1, STEPS),
-    TRAJECTORIES * BATCH: (TRAJECTORIES, 1),
-    TRAJECTORIES * BATCH * STEPS: (TRAJECTORIES, STEPS),
-}
-
+FLATTENED = [(1, 1), (1, STEPS), (TRAJECTORIES, 1), (TRAJECTORIES, STEPS)]
+"""What is flattened with the axis that has a row for each sequence: before and after it."""
 DRAWS = {  # functions without a generator of their own, and what they fill a tensor with
     **dict.fromkeys(("randn", "randn_like"), torch.Tensor.normal_),
     **dict.fromkeys(("rand", "rand_like"), torch.Tensor.uniform_),
@@ -30,7 +25,7 @@ DRAWS = {  # functions without a generator of their own, and what they fill a te
 
 
 class NoiseOfRanks(TorchFunctionMode):
-    """Draws what the ranks would draw, each for its own rows."""
+    """Draws what the ranks would draw, each for its own rows, by a generator for every `BATCH / RANKS` sequences."""
 
     def __init__(self):
         super().__init__()
@@ -41,12 +36,14 @@ class NoiseOfRanks(TorchFunctionMode):
         if name not in DRAWS or not self.generators or "generator" in kwargs:
             return func(*args, **kwargs)
         like = func(*args, **kwargs)  # its values are replaced
-        axis = next(axis for axis, size in enumerate(like.shape) if size in ROWS)
-        before, after = ROWS[like.shape[axis]]
-        shares = like.new_empty(RANKS, *like.shape[:axis], like.shape[axis] // RANKS, *like.shape[axis + 1 :])
+        number, rows = len(self.generators), BATCH // RANKS  # shares, and sequences of each
+        sizes = {before * number * rows * after: (before, after) for before, after in FLATTENED}
+        axis = next(axis for axis, size in enumerate(like.shape) if size in sizes)
+        before, after = sizes[like.shape[axis]]
+        shares = like.new_empty(number, *like.shape[:axis], like.shape[axis] // number, *like.shape[axis + 1 :])
         for share, generator in zip(shares, self.generators, strict=True):
             DRAWS[name](share, generator=generator)
-        parts = [share.unflatten(axis, (before, BATCH // RANKS, after)) for share in shares]
+        parts = [share.unflatten(axis, (before, rows, after)) for share in shares]
         return like.copy_(torch.cat(parts, axis + 1).flatten(axis, axis + 2))
 
 
@@ -61,11 +58,14 @@ def on_two_ranks(tmp_path_factory):
 
 @pytest.fixture
 def noise_of_ranks(monkeypatch):
-    """Let one process draw the noise of two in its updates."""
+    """Let one process draw the noise of two in its updates, also that of all micro-batches in one batch."""
     noise = NoiseOfRanks()
 
     def seed_update(module, _):
-        seeds = [derive_seed(module.seed, purpose, module.batches_before) for purpose in ("update", "update/1")]
+        at_once = module.trainer.datamodule.batch_size // BATCH
+        numbers = range(at_once * module.batches_before, at_once * (module.batches_before + 1))
+        seeds = [derive_seed(module.seed, purpose, n) for n in numbers for purpose in ("update", "update/1")]
+        assert len({*seeds}) == RANKS * at_once
         noise.generators = [torch.Generator().manual_seed(seed) for seed in seeds]
 
     def begin(module):
@@ -89,3 +89,17 @@ def test_two_ranks_make_the_update_of_one_process(kind, on_two_ranks, noise_of_r
             assert ours.keys() == theirs.keys()
             torch.testing.assert_close(ours, theirs, rtol=rtol, atol=atol, equal_nan=True)
         assert all(values.isfinite().all() for values in of_rank[kind][-1].values())  # weights
+
+
+def test_accumulated_shares_of_ranks_make_the_update_of_the_whole_batch(on_two_ranks, noise_of_ranks):
+    """Two micro-batches on each of two ranks, with noise of their own, where the loss is a mean over sequences."""
+    *expected, _, weights = train(ACCUMULATED, ranks=1, at_once=True)
+
+    for of_rank in on_two_ranks:
+        *updates, _, found = of_rank[ACCUMULATED]
+        for ours, theirs in zip(updates, expected, strict=True):
+            gradients = [name for name in theirs if name in weights]
+            assert gradients
+            for name in gradients:
+                torch.testing.assert_close(ours[name], theirs[name], rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(found, weights, rtol=1e-9, atol=1e-12)

@@ -1,7 +1,7 @@
 """Jobs as tasks of a Ray cluster. A lost worker or node costs at most the updates since the last checkpoint.
 
-Where a node does not see the output folder, it trains in a temporary folder, and each new checkpoint is brought back
-with the rest of the run folder. So a job continues on any node.
+Where a node does not see the output folder, it trains in a temporary copy of the run folder. With each new checkpoint,
+the files that have changed are brought back. So a job continues on any node.
 """
 
 import os
@@ -13,7 +13,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,13 +21,26 @@ import ray
 from ray.exceptions import RayError, TaskCancelledError
 
 from forbes.commands.jobs import Job, checkpoint_time
+from forbes.commands.launchers.changes import changes, stamps, write_changes
 from forbes.commands.launchers.process import end, follow, start
 from forbes.errors import ForbesError
 from forbes.files import replace_file
+from forbes.runs.folder import RunFolder
 
 __all__ = ["Ray"]
 
 _POLL = 1.0  # seconds between looks for a new checkpoint
+_UNSEEN = 1000
+"""Status of a task that was not run, since its node does not see the output folder; no process ends with it."""
+
+
+class _Content(NamedTuple):
+    """Files that a node needs which does not see the output folder."""
+
+    named: Mapping[str, bytes]
+    """Files that are named in the command, by their name there."""
+    run: Mapping[str, Any]
+    """References of the files of the run folder, by their path in it."""
 
 
 class Ray:
@@ -43,10 +56,11 @@ class Ray:
 
     def __init__(self, folder: Path, address: str | None, cpus: int, gpus: float, at_once: int) -> None:
         self.at_once = at_once
-        self._folder, self._address, self._cpus, self._gpus = folder, address, cpus, gpus
+        self._address, self._cpus, self._gpus = address, cpus, gpus
         self._mark = (folder / f".seen-{secrets.token_hex(8)}").absolute()
         self._lock, self._stopping = threading.Lock(), False
         self._running: dict[str, Any] = {}  # results of the tasks by name
+        self._must_send = False  # whether a node was seen that does not see the output folder
 
     @contextmanager
     def ready(self, jobs: Sequence[Job]) -> Iterator[None]:
@@ -60,7 +74,10 @@ class Ray:
             _require_answer(address)
             ray.init(address=address, log_to_driver=False, logging_level="WARNING")
             signal.signal(signal.SIGTERM, handler)  # Ray's own would end this process before its jobs
-        except (OSError, RuntimeError, ValueError) as error:
+        except RuntimeError as error:  # other versions, e.g.
+            reason = " ".join(str(error).split())
+            raise ForbesError(f"--launcher ray: the cluster cannot be joined ({reason}). Change one of them") from error
+        except (OSError, ValueError) as error:
             where = "here" if address == "auto" else f"at {address}"
             raise ForbesError(
                 f"--launcher ray: no Ray cluster {where}. Start one: ray start --head, or name one: --address HOST:PORT"
@@ -74,13 +91,25 @@ class Ray:
             ray.shutdown()
 
     def attempt(self, job: Job, say: Callable[[str], None]) -> int:
-        """Run a job as a task, and return its exit status; 1 if its worker or node was lost."""
+        """Run a job as a task, and return its exit status; 1 if its worker or node was lost.
+
+        Raises:
+            ForbesError: if the run folder is written to by another process, or cannot be written.
+        """
+        status = _UNSEEN if self._must_send else self._run(job, None, say)
+        if status != _UNSEEN:
+            return status
+        self._must_send = True
+        with RunFolder(job.run).locked() if job.run else nullcontext():  # no node can lock it
+            return self._run(job, _content_of(job), say)
+
+    def _run(self, job: Job, content: _Content | None, say: Callable[[str], None]) -> int:
+        """Run a task, and return its exit status; `_UNSEEN` if its node needs the content."""
         task = ray.remote(num_cpus=self._cpus, num_gpus=self._gpus, max_retries=0)(_work)
-        content = ray.put(_Content(_files_named(job), _files_of(job.run) if job.run else {}))
         with self._lock:
             if self._stopping:
                 return -signal.SIGTERM
-            results = task.options(name=job.name).remote(job, self._cpus, str(Path.cwd()), str(self._mark), [content])
+            results = task.options(name=job.name).remote(job, self._cpus, str(Path.cwd()), str(self._mark), content)
             self._running[job.name] = results
         status = 1
         try:
@@ -89,7 +118,7 @@ class Ray:
                 if isinstance(found, str):
                     say(found)
                 elif isinstance(found, dict):
-                    _write(Path(job.run), found)
+                    write_changes(Path(job.run), found)
                 else:
                     status = found
         except TaskCancelledError:
@@ -97,6 +126,9 @@ class Ray:
         except RayError as error:
             say(f"lost: {str(error).strip().splitlines()[-1]}")
             return 1
+        except ForbesError:  # the folder cannot be written
+            ray.cancel(results)
+            raise
         finally:
             with self._lock:
                 del self._running[job.name]
@@ -124,41 +156,43 @@ def _require_answer(address: str) -> None:
             pass
 
 
-class _Content(NamedTuple):
-    """Files that a node needs which does not see the output folder."""
-
-    named: Mapping[str, bytes]
-    """Files that are named in the command, by their name there."""
-    run: Mapping[str, bytes]
-    """Files of the run folder, by their path in it."""
+def _content_of(job: Job) -> _Content:
+    """Put the files that a job needs into the cluster, one at a time, since an agent's episodes take gigabytes."""
+    named = {word: Path(word).read_bytes() for word in job.command if Path(word).is_file()}
+    stored = stamps(job.run) if job.run else {}
+    return _Content(named, {name: ray.put(Path(job.run, name).read_bytes()) for name in stored})
 
 
 def _work(
-    job: Job, threads: int, place: str, mark: str, content: Sequence[Any]
-) -> Iterator[str | dict[str, bytes] | int]:
-    """Run a job on a node. Yield its lines, its run folder after each checkpoint if needed, and its exit status.
+    job: Job, threads: int, place: str, mark: str, content: _Content | None
+) -> Iterator[str | dict[str, bytes | None] | int]:
+    """Run a job on a node. Yield its lines, what changes in its run folder if it must be sent, and its exit status.
 
     Args:
         job: job to run.
         threads: CPU threads.
-        place: working directory of the command, used if the node sees the output folder.
+        place: working directory of the command, used without `content`.
         mark: file in the output folder, which shows whether the node sees it.
-        content: reference of a `_Content`, used if it does not.
+        content: files that the job needs; None to use those of the output folder. If the node does not see it, the job
+            is not run, and `_UNSEEN` is yielded.
     """
+    if content is None and not Path(mark).is_file():
+        yield _UNSEEN
+        return
     yield f"starts on {socket.gethostname()}, node {ray.get_runtime_context().get_node_id()}"
-    if Path(mark).is_file():
+    if content is None:
         with closing(_lines(start(job.current(), threads, place))) as lines:
             yield from (found for found in lines if found != "")
         return
     with tempfile.TemporaryDirectory(prefix="forbes-") as folder:
-        moved = _moved(job, ray.get(content[0]), Path(folder))
-        sent = checkpoint_time(moved)
+        moved = _moved(job, content, Path(folder))
+        known, sent = stamps(moved.run), checkpoint_time(moved)
         with closing(_lines(start(moved.current(), threads, folder))) as lines:
             for found in lines:
                 now = checkpoint_time(moved)
                 if now != sent or isinstance(found, int):
                     sent = now
-                    yield _files_of(moved.run)
+                    yield changes(moved.run, known)
                 if found != "":
                     yield found
 
@@ -182,30 +216,11 @@ def _lines(process: subprocess.Popen[str]) -> Generator[str | int, None, None]:
 def _moved(job: Job, content: _Content, folder: Path) -> Job:
     """Write the content to a folder, and return the job with its paths in that folder."""
     run = folder / "run"
-    _write(run, content.run)
+    for name, reference in content.run.items():
+        replace_file(run / name, ray.get(reference))
     places = {job.run: str(run)}
     for number, (name, of_file) in enumerate(content.named.items()):
         places[name] = str(folder / f"{number}-{Path(name).name}")
         replace_file(Path(places[name]), of_file)
     command, resume = ([places.get(word, word) for word in words] for words in (job.command, job.resume))
     return job._replace(command=command, resume=resume, run=str(run))
-
-
-def _files_named(job: Job) -> dict[str, bytes]:
-    """Return the files that are named in a command, e.g. configurations."""
-    return {word: Path(word).read_bytes() for word in job.command if Path(word).is_file()}
-
-
-def _files_of(run: str) -> dict[str, bytes]:
-    """Return the files of a run folder: checkpoints first, so that the metrics are not older."""
-    paths = [path for path in Path(run).rglob("*") if path.is_file() and not path.name.startswith(".")]
-    paths.sort(key=lambda path: (path.parent.name != "checkpoints", path))
-    return {path.relative_to(run).as_posix(): path.read_bytes() for path in paths}
-
-
-def _write(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write the files that have changed, the checkpoints last, so that a kill leaves metrics that are not older."""
-    for name, of_file in reversed([*files.items()]):
-        path = folder / name
-        if not path.is_file() or path.read_bytes() != of_file:
-            replace_file(path, of_file)

@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any
 
 import submitit
-from submitit.core.utils import DelayedSubmission, UncompletedJobError
+from submitit.core.utils import DelayedSubmission, FailedJobError, FailedSubmissionError, UncompletedJobError
 
 from forbes.commands.jobs import Job
 from forbes.commands.launchers.process import follow, start
@@ -95,11 +95,21 @@ class Slurm:
                 handle.cancel(check=False)
 
     def _submit(self, jobs: Sequence[Job]) -> None:
-        if jobs:
+        """Submit jobs as an array, and record their numbers.
+
+        Raises:
+            ForbesError: if SLURM refuses them.
+        """
+        if not jobs:
+            return
+        try:
             handles = self._executor.submit_array([_Work(job) for job in jobs])
-            self._known |= {job.name: handle for job, handle in zip(jobs, handles, strict=True)}
-            self._numbers |= {job.name: handle.job_id for job, handle in zip(jobs, handles, strict=True)}
-            replace_file(self._record, json.dumps(self._numbers, indent=2).encode() + b"\n")
+        except (FailedJobError, FailedSubmissionError) as error:
+            reason = next((line for line in str(error).splitlines() if line.strip()), "no reason given")
+            raise ForbesError(f"--launcher slurm: SLURM refuses the jobs ({reason}). Change --slurm") from error
+        self._known |= {job.name: handle for job, handle in zip(jobs, handles, strict=True)}
+        self._numbers |= {job.name: handle.job_id for job, handle in zip(jobs, handles, strict=True)}
+        replace_file(self._record, json.dumps(self._numbers, indent=2).encode() + b"\n")
 
     def _is_done(self, handle: Any) -> bool:
         with self._lock:  # submitit asks SLURM for all jobs at once
@@ -193,9 +203,11 @@ def _executor(folder: Path, options: dict[str, str], at_once: int) -> Any:
             "--launcher slurm: srun is missing here. Run the command on a machine of the cluster"
         ) from error
     ours = {key: int(options.pop(key, default)) for key, default in _OURS.items()}
+    cpus = options.get("cpus_per_task")  # since SLURM 22.05, srun has one CPU unless it is told again
     executor.update_parameters(
         job_name="forbes",
         array_parallelism=at_once,
+        srun_args=[f"--cpus-per-task={cpus}"] if cpus else [],
         wckey=None,
         additional_parameters={"requeue": True, **options},
         **ours,

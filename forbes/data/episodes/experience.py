@@ -8,12 +8,13 @@ from typing import Any
 from torch import Tensor
 
 from forbes.choices import LONGEST
-from forbes.data.episodes.collection import MakePolicy, collect_episodes, describe_environment, episode_seed
-from forbes.data.episodes.episode import EpisodeRecord
+from forbes.data.episodes.collection import MakePolicy, describe_environment, episode_seed, play_whole
+from forbes.data.episodes.episode import Episode, EpisodeRecord
 from forbes.data.episodes.replay import Replay, Segments
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter, first_held
 from forbes.data.episodes.worker import EpisodeWorker
 from forbes.data.source import SequenceBatch, SequenceSource, Split
+from forbes.distributed import gathered, num_ranks, rank
 from forbes.envs import TIME_LIMIT, EnvironmentProcess, find_environment
 from forbes.errors import ForbesError
 
@@ -121,18 +122,30 @@ class Experience(SequenceSource):
             if name in self.__dict__:
                 self.__dict__.pop(name).close()
 
-    def collect(self, until: int, make_policy: MakePolicy, policy: str, seed: int) -> Iterator[EpisodeRecord]:
-        """Play and store episodes up to number `until`. Episode n depends only on (seed, n) and the policy.
+    def collect(
+        self, numbers: range, make_policy: MakePolicy, policy: str, seed: int, per_rank: bool = False
+    ) -> Iterator[EpisodeRecord]:
+        """Play and store the next episodes. Episode n depends only on (seed, n) and the policy.
 
         Args:
-            until: total number of episodes, including existing ones.
+            numbers: numbers of the episodes; the first is the watermark.
             make_policy: function that makes the policy of an episode.
             policy: name of the policy, for the record.
             seed: random seed for episodes and policies.
+            per_rank: whether all ranks call this with the same policy, and each plays every R-th episode. The first one
+                stores all in their order.
+
+        Yields:
+            Record of each episode, once it is safely stored; nothing in the other ranks.
         """
-        for record in collect_episodes(self.environment, self._require_writer(), make_policy, policy, until, seed):
-            self._refresh()
-            yield record
+        ranks, first = (num_ranks(), rank()) if per_rank else (1, 0)
+        for start in range(numbers.start, numbers.stop, ranks):
+            number, episode = start + first, None
+            if number in numbers:
+                episode = play_whole(self.environment, make_policy, episode_seed(seed, number), number)
+            for played in gathered(episode) if per_rank else [episode]:
+                if played is not None:
+                    yield self._store(played, policy, seed)
 
     def begin(self, make_policy: MakePolicy, seed: int) -> None:
         """Start the next episode in the background; `finish` stores it.
@@ -146,19 +159,23 @@ class Experience(SequenceSource):
 
     def finish(self, policy: str, seed: int) -> EpisodeRecord:
         """Wait for the episode started by `begin`, and store it. The arguments are those of `collect`."""
-        writer, episode = self._require_writer(), self.player.finish()
+        return self._store(self.player.finish(), policy, seed)
+
+    def _store(self, episode: Episode, policy: str, seed: int) -> EpisodeRecord:
+        """Store the next episode, and sample from it, too."""
+        writer = self._require_writer()
         seed_of_episode = episode_seed(seed, writer.watermark)
         record = writer.append(episode, seed_of_episode, policy, describe_environment(self.environment))
         self._refresh()
         return record
 
-    def forget(self) -> None:
-        """Delete episodes beyond `capacity`. Call only after a checkpoint has recorded the newest one.
+    def forget(self, newest: int = 1) -> None:
+        """Delete episodes beyond `capacity`. Call only after a checkpoint has recorded the newest ones.
 
-        Episodes that the previous checkpoint, without the newest episode, may still sample are kept.
+        Episodes that the previous checkpoint may still sample, without the `newest` ones, are kept.
         """
         writer = self._require_writer()
-        writer.forget(first_held([*writer.records.values()][:-1], self.capacity))
+        writer.forget(first_held([*writer.records.values()][:-newest], self.capacity))
         self._refresh()
 
     def growth(self, episodes: int) -> float:
@@ -183,10 +200,9 @@ class Experience(SequenceSource):
             count += 1
         return count
 
-    @property
-    def newest(self) -> EpisodeRecord:
-        """Record of the latest stored episode."""
-        return list(self._require_writer().records.values())[-1]
+    def newest(self, count: int = 1) -> list[EpisodeRecord]:
+        """Return the records of the latest stored episodes, the newest last."""
+        return list(self._require_writer().records.values())[-count:]
 
     @property
     def env_steps(self) -> int:
