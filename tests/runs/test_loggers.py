@@ -76,7 +76,9 @@ def test_validation_of_a_run_with_a_logger_writes_nothing(tiny_config, in_tmp_pa
         ("CometLogger", "needs comet_ml, which is not installed. Install it: pip install comet-ml"),
     ],
 )
-def test_a_logger_without_its_package_says_what_to_install(name, sentence, tiny_config, in_tmp_path, monkeypatch, capsys):
+def test_a_logger_without_its_package_says_what_to_install(
+    name, sentence, tiny_config, in_tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr("forbes.runs.loggers.find_spec", lambda module: None)
 
     said = error_of(capsys, "fit", "--config", tiny_config, "--trainer.logger", name, "--run_dir", "run")
