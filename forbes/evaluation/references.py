@@ -1,7 +1,9 @@
 r"""Reference scores that a model should exceed: log p of the same sequences under models without a belief.
 
-For digit strokes, n-grams of pen moves (`forbes.evaluation.ngram`). For images with a Gaussian likelihood, two constant
-predictions with the model's own standard deviation: the previous frame, and the mean frame of the training split,
+For digit strokes, n-grams of pen moves (`forbes.evaluation.ngram`), under a likelihood that is a probability of binary
+pixels. `whole` and `written` frames are the same events, see `Strokes`, so the n-grams are references for both. For
+images with a Gaussian likelihood, two constant predictions with the model's own standard deviation: the previous frame,
+and the mean frame of the training split,
 
 .. math:: \log p(o_{1:T}) = \sum_t \log N(o_t;\, o_{t-1}, \sigma^2), \qquad \sum_t \log N(o_t;\, \bar o, \sigma^2),
 
@@ -26,12 +28,12 @@ _EXAMPLES, _ROWS = 500, 50
 
 def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
     """Return log p of each step of the first `count` sequences in nats, float64 `(N, T)`, by name; 0 on padding."""
+    if isinstance(likelihood, Normal):  # a density, also of strokes
+        with forked("cpu", 0):  # for the dequantisation noise of coarse pixels
+            return _still_pictures(data, likelihood, split, count)
     if isinstance(data.source, Strokes):
         ngrams = fit_ngrams(data.source, data.length)
         return {f"{order}-gram": values for order, values in ngrams.log_prob(split, count).items()}
-    if isinstance(likelihood, Normal):
-        with forked("cpu", 0):  # for the dequantisation noise of coarse pixels
-            return _still_pictures(data, likelihood, split, count)
     return {}
 
 
