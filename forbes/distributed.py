@@ -111,23 +111,27 @@ def of_all_ranks(value: T) -> list[T]:
 
 
 class WeightedMeans:
-    """Means of scalars over the batches of all ranks, which may differ in number and size. Their sums are float64."""
+    """Means of scalars over the batches of all ranks, which may differ in number and size.
+
+    The sums are float64. They stay on the device of the values, so that a batch need not wait for the one before.
+    """
 
     def __init__(self) -> None:
-        self._sums: dict[str, tuple[float, float]] = {}
+        self._sums: dict[str, tuple[Tensor, float]] = {}
 
     def add(self, values: Mapping[str, Tensor], weight: float) -> None:
         """Add the values of a batch by name, with the weight of the batch."""
         for name, value in values.items():
             total, weights = self._sums.get(name, (0.0, 0.0))
-            self._sums[name] = total + weight * float(value), weights + weight
+            self._sums[name] = total + weight * value.detach().double(), weights + weight
 
     def compute(self) -> dict[str, float]:
         """Return the mean of each value. All ranks must call this, also one that had no batch."""
-        of_ranks = of_all_ranks(self._sums)
+        totals = torch.stack([total for total, _ in self._sums.values()]).tolist() if self._sums else []
+        of_ranks = of_all_ranks({n: (total, self._sums[n][1]) for n, total in zip(self._sums, totals, strict=True)})
         names = dict.fromkeys(name for sums in of_ranks for name in sums)
-        totals = {name: [sums[name] for sums in of_ranks if name in sums] for name in names}
-        return {name: sum(t for t, _ in found) / sum(w for _, w in found) for name, found in totals.items()}
+        found = {name: [sums[name] for sums in of_ranks if name in sums] for name in names}
+        return {name: sum(t for t, _ in sums) / sum(w for _, w in sums) for name, sums in found.items()}
 
 
 class _Sum(torch.autograd.Function):

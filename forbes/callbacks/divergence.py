@@ -1,9 +1,10 @@
 """Stop a training before the first update that is not finite."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
@@ -33,6 +34,21 @@ class StopAtDivergence(Callback):
 
     def __init__(self, run: RunFolder) -> None:
         self.run = run
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Copy what is not optimised, e.g. running averages: a held optimiser does not keep it from changing."""
+        optimised = {name for name, parameter in pl_module.named_parameters() if parameter.requires_grad}
+        state = {name: values for name, values in pl_module.state_dict().items() if name not in optimised}
+        self._moving = {name: (values, values.clone()) for name, values in state.items()}
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
+        """Copy it again before each update, up to that of the divergence."""
+        if not self._moving or batch_idx % trainer.accumulate_grad_batches:
+            return
+        never = torch.full((), math.inf, device=pl_module.device)
+        held_from = torch.stack([vars(optimizer).get("held_from", never) for optimizer in trainer.optimizers])
+        for values, copy in self._moving.values():
+            copy.copy_(torch.where(held_from.isfinite().any(), copy, values))
 
     def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:
         """Hold the optimiser if the loss is not finite. The module does this for the gradient."""
@@ -69,7 +85,8 @@ class StopAtDivergence(Callback):
             return
         update = int(held)
         if trainer.is_global_zero:
-            AtomicCheckpointIO().save_checkpoint(_failure_record(trainer, module, update), self.run.failure)
+            before = {name: copy for name, (_, copy) in self._moving.items()}
+            AtomicCheckpointIO().save_checkpoint(_failure_record(trainer, module, update, before), self.run.failure)
         command = f"forbes fit --resume {self.run}" if self.run.checkpoint.exists() else "the same command"
         raise DivergedError(
             f"{self.run}: diverged, the loss or gradient of update {update + 1} is not finite. See where: "
@@ -78,8 +95,17 @@ class StopAtDivergence(Callback):
         )
 
 
-def _failure_record(trainer: Trainer, module: LightningModule, update: int) -> dict[str, Any]:
-    """Return plain values and tensors from which the update can be recomputed, with the weights before it."""
+def _failure_record(
+    trainer: Trainer, module: LightningModule, update: int, before: Mapping[str, Tensor]
+) -> dict[str, Any]:
+    """Return plain values and tensors from which the update can be recomputed, with the state before it.
+
+    Args:
+        trainer: its optimiser has changed nothing since.
+        module: module whose weights are those before the update.
+        update: number of the update.
+        before: what is not optimised, as it was before the update.
+    """
     data = datamodule_of(trainer)
     numbers = _batches_of(update, int(trainer.num_training_batches), trainer.accumulate_grad_batches)
     drawn: Sequence[int] = numbers
@@ -91,7 +117,7 @@ def _failure_record(trainer: Trainer, module: LightningModule, update: int) -> d
         "processes": trainer.world_size,
         "device": module.device.type,
         "precision": trainer.precision,
-        "state_dict": module.state_dict(),
+        "state_dict": module.state_dict() | before,
         "optimizer_states": [optimizer.state_dict() for optimizer in trainer.optimizers],
         "batch_numbers": [*numbers],
         "batches": [data.sequences("train", data.train_index(number))._asdict() for number in drawn],

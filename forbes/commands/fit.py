@@ -28,6 +28,7 @@ from forbes.callbacks.divergence import StopAtDivergence
 from forbes.callbacks.picture import FileCallback
 from forbes.commands.fit_options import FitOptions
 from forbes.commands.lower_rate import MOST, LowerRateError, at_half_the_rate
+from forbes.commands.next_steps import next_steps
 from forbes.commands.parsers.fit import DESCRIPTION, run_options
 from forbes.commands.trainer_arguments import require_processes, require_usable
 from forbes.data import SequenceDataModule
@@ -295,6 +296,8 @@ class _Experiment(LightningCLI):
             _print_metrics(found)
         elif self.trainer.global_step == updates:
             print(f"nothing was trained: {self._limits()} ends at update {updates}. Set a higher limit to continue")
+        elif self.stop is not None:
+            print(next_steps(self.stop.run, self.model))
         return 0
 
     def _limits(self) -> str:

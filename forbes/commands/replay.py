@@ -85,6 +85,7 @@ def first_not_finite(module: WorldModel | KnownBelief, failure: Mapping[str, Any
             if watch.found:
                 return watch.found[0]
             loss.backward()
+        module.on_train_batch_end(None, batch, 1)  # moves averages between the batches of an update
     gradients = [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
     watch.look("the norm of all gradients", torch.nn.utils.get_total_norm(gradients))
     return next(iter(watch.found), None)
@@ -110,7 +111,8 @@ class _Watch:
         for name, part in module.named_modules():
             part.register_forward_hook(partial(self._after, name))
         for name, parameter in module.named_parameters():
-            parameter.register_post_accumulate_grad_hook(partial(self._accumulated, name))
+            if parameter.requires_grad:
+                parameter.register_post_accumulate_grad_hook(partial(self._accumulated, name))
 
     def look(self, name: str, values: Any) -> None:
         """Record the tensors in `values` that are not finite."""

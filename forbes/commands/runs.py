@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rich import box
+from rich.cells import cell_len
 from rich.markup import escape
 from rich.table import Table
 
@@ -21,6 +22,12 @@ from forbes.runs.summary import RunSummary, find_runs, objective_of, summarise
 __all__ = ["main"]
 
 _WIDTH = 80
+_LEFT_OUT = ("age", "seed", "updates", "data", "method")
+"""Columns that a narrow terminal does not show, in this order: the name of a run is what identifies it."""
+_FOLDED = 12
+"""Width of method and data, below which they are left out instead of folded."""
+_GAP = 2
+"""Blank columns after a cell."""
 _STYLES = {"running": "green", "failed": "red", "stopped": "yellow"}
 _UNITS = (("d", 86400), ("h", 3600), ("min", 60))
 
@@ -49,31 +56,72 @@ def _list(folder: Path) -> None:
         except ForbesError as error:
             damaged.append(str(error))
     if found:
-        console(_WIDTH).print(_table(found, folder))
+        _print_tables(found, folder)
     else:
         print(f"{folder}: no runs")
     for sentence in damaged:
         print(f"forbes: {sentence}", file=sys.stderr)
 
 
-def _table(runs: Sequence[RunSummary], folder: Path) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    agents = any(run.env_steps is not None for run in runs)
-    for header in ("run", "method", "data"):
-        table.add_column(header, overflow="fold")
-    for header in ("seed", "updates", *(["env steps"] if agents else []), "score", "age"):
-        table.add_column(header, justify="right", no_wrap=True)
-    table.add_column("state", no_wrap=True)
-    for run in runs:
-        name = "." if run.path == folder else str(run.path.relative_to(folder))
-        style = _STYLES.get(run.state, "")
-        table.add_row(
-            *map(escape, (name, run.method, run.data)),
-            *map(_count, (run.seed, run.update, *([run.env_steps] if agents else []))),
-            "" if run.score is None else f"{run.score[0]} {_value(run.score[1])}",
-            _age(run.started),
-            f"[{style}]{run.state}[/{style}]" if style else run.state,
-        )
+def _print_tables(runs: Sequence[RunSummary], folder: Path) -> None:
+    """Print a table of the runs without env steps, and one of those with them, which have a column more."""
+    screen, hidden = console(_WIDTH), dict[str, None]()
+    for acting in (False, True):
+        rows = [_row(run, folder) for run in runs if acting == (run.env_steps is not None)]
+        if not rows:
+            continue
+        widths = _widths(rows, screen.width)
+        screen.print(_table(rows, widths))
+        hidden |= dict.fromkeys(name for name in _LEFT_OUT if name not in widths)
+    if hidden:
+        print(f"no room in {screen.width} columns: {', '.join(hidden)}")
+
+
+def _row(run: RunSummary, folder: Path) -> dict[str, str]:
+    """Return the cells of a run by the name of their column."""
+    acted = {} if run.env_steps is None else {"env steps": _count(run.env_steps)}
+    return {
+        "run": "." if run.path == folder else str(run.path.relative_to(folder)),
+        "method": run.method,
+        "data": run.data,
+        "seed": _count(run.seed),
+        "updates": _count(run.update),
+        **acted,
+        "score": "" if run.score is None else f"{run.score[0]} {_value(run.score[1])}",
+        "age": _age(run.started),
+        "state": run.state,
+    }
+
+
+def _widths(rows: Sequence[dict[str, str]], width: int) -> dict[str, int]:
+    """Return the columns to show and their widths, so that names of runs are folded only where nothing else is left."""
+    whole = {name: max(cell_len(name), *(cell_len(row[name]) for row in rows)) for name in rows[0]}
+    shown = whole | {name: min(whole[name], _FOLDED) for name in ("method", "data")}
+
+    def room() -> int:
+        return width - sum(shown.values()) - _GAP * len(shown)
+
+    for name in _LEFT_OUT:
+        if room() < 0:
+            del shown[name]
+    for name in ("method", "data"):
+        if name in shown:
+            shown[name] = min(whole[name], shown[name] + room())
+    shown["run"] += min(0, room())
+    return shown
+
+
+def _table(rows: Sequence[dict[str, str]], widths: dict[str, int]) -> Table:
+    """Return the table. What is longer than its column is folded."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, _GAP - 1, 0, 0))
+    for name, width in widths.items():
+        justify = "left" if name in ("run", "method", "data", "state") else "right"
+        table.add_column(name, justify=justify, width=width, overflow="fold")
+    for row in rows:
+        cells = {name: escape(row[name]) for name in widths}
+        if style := _STYLES.get(row["state"]):
+            cells["state"] = f"[{style}]{row['state']}[/{style}]"
+        table.add_row(*cells.values())
     return table
 
 

@@ -1,9 +1,9 @@
-"""Measure the contrast of a claim from the records of runs, seed by seed, and check Theorem 1 in closed form."""
+"""Measure the contrast of a claim from the records of runs, seed by seed."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,20 +14,9 @@ from forbes.evaluation.claims import Claim
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.metrics import score_of
 from forbes.evaluation.record import read_arrays, read_record
-from forbes.evaluation.theorem import (
-    ClosedFormProcess,
-    elbo,
-    exact_filter,
-    exact_one_step,
-    expected_kl,
-    factorised_optimum,
-    log_evidence,
-    smoothing,
-    structured_optimum,
-)
 from forbes.reading import is_number, read_json
 
-__all__ = ["TheoremGaps", "contrast", "entry_of", "task_of", "theorem_gaps"]
+__all__ = ["Runs", "contrast", "entry_of", "task_of"]
 
 Runs = Mapping[tuple[str, int], str]
 """Folders of finished runs by family and seed."""
@@ -125,26 +114,3 @@ def _completed(claim: Claim, path: Path | None) -> Estimate | None:
             mean, error = entry["mean"], entry["standard_error"]
             return Estimate(claim.sign * mean, error) if is_number(mean) and is_number(error) else None
     return None
-
-
-class TheoremGaps(NamedTuple):
-    """Both forms of Theorem 1 in closed form, over processes and posteriors."""
-
-    filtering: Sequence[float]
-    """|Σ KL to the filtering beliefs − (log p − ELBO)|, nats per sequence: the paper's form."""
-    smoothing: Sequence[float]
-    """The same with the smoothing conditionals."""
-
-
-def theorem_gaps(steps: int = 15) -> TheoremGaps:
-    """Return the errors of both forms of Theorem 1 for three linear-Gaussian processes and four posteriors of each."""
-    filtering, smoothed = [], []
-    for case in ((1.0, 1.0, 1.0), (1.0, 0.1, 1.0), (0.9, 0.3, 0.5)):
-        process = ClosedFormProcess(*case, steps)
-        moment = process.moment()
-        for posterior_of in (exact_filter, exact_one_step, factorised_optimum, structured_optimum):
-            posterior = posterior_of(process)
-            gap = (log_evidence(process, moment) - elbo(process, posterior, moment)).item()
-            filtering.append(abs(expected_kl(posterior, exact_filter(process), moment).item() - gap))
-            smoothed.append(abs(expected_kl(posterior, smoothing(process), moment).item() - gap))
-    return TheoremGaps(filtering, smoothed)

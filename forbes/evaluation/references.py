@@ -1,7 +1,9 @@
 r"""Reference scores that a model should exceed: log p of the same sequences under models without a belief.
 
-For digit strokes, n-grams of pen moves (`forbes.evaluation.ngram`). For images and vectors with a Gaussian likelihood,
-predictions with the model's own standard deviation: the mean of the training split, and the previous observation,
+For digit strokes, n-grams of pen moves (`forbes.evaluation.ngram`), under a likelihood that is a probability of binary
+pixels. `whole` and `written` frames are the same events, see `Strokes`, so the n-grams are references for both. For
+images and vectors with a Gaussian likelihood, predictions with the model's own standard deviation: the mean of the
+training split, and the previous observation,
 
 .. math:: \log p(o_{1:T}) = \sum_t \log N(o_t;\, \bar o, \sigma^2), \qquad \sum_t \log N(o_t;\, o_{t-1}, \sigma^2),
 
@@ -33,12 +35,13 @@ _NAMES = {3: ("mean frame", "last frame"), 1: ("mean observation", "last observa
 
 def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
     """Return log p of each step of the first `count` sequences in nats, float64 `(N, T)`, by name; 0 on padding."""
+    known = isinstance(data.source, Simulated)
+    if isinstance(likelihood, Normal | VectorNormal | SymlogNormal) and not known:  # densities, also of strokes
+        with forked("cpu", 0):  # for the dequantisation noise of coarse pixels
+            return _predictions(data, likelihood, split, count)
     if isinstance(data.source, Strokes):
         ngrams = fit_ngrams(data.source, data.length)
         return {f"{order}-gram": values for order, values in ngrams.log_prob(split, count).items()}
-    if isinstance(likelihood, Normal | VectorNormal | SymlogNormal) and not isinstance(data.source, Simulated):
-        with forked("cpu", 0):  # for the dequantisation noise of coarse pixels
-            return _predictions(data, likelihood, split, count)
     return {}
 
 

@@ -13,15 +13,16 @@ itself, the value for that sequence.
 """
 
 import math
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal, Normal
 
-__all__ = ["BeliefScores", "ClosedFormProcess", "Conditional", "belief_scores", "between", "elbo", "exact_filter"]
-__all__ += ["exact_one_step", "expected_kl", "factorised_optimum", "log_evidence", "sample_gap", "smoothing"]
-__all__ += ["structured_optimum"]
+__all__ = ["POSTERIORS", "PROCESSES", "BeliefScores", "ClosedFormProcess", "Conditional", "Identity", "belief_scores"]
+__all__ += ["between", "elbo", "exact_filter", "exact_one_step", "expected_kl", "factorised_optimum", "identity"]
+__all__ += ["log_evidence", "sample_gap", "smoothing", "structured_optimum"]
 
 
 class ClosedFormProcess(NamedTuple):
@@ -220,6 +221,36 @@ def factorised_optimum(process: ClosedFormProcess) -> Conditional:
         row = alpha * mean + beta * row + gamma * current
         rows.append(row)
     return Conditional(torch.zeros_like(diagonal), torch.stack(rows), 1 / diagonal)
+
+
+PROCESSES = (ClosedFormProcess(1.0, 1.0, 1.0), ClosedFormProcess(1.0, 0.1, 1.0), ClosedFormProcess(0.9, 0.3, 0.5))
+"""The processes for which Theorem 1 is checked."""
+POSTERIORS: Mapping[str, Callable[[ClosedFormProcess], Conditional]] = {
+    "exact p(s_t|o_1:t)": exact_filter,
+    "exact p(s_t|s_t-1,o_t)": exact_one_step,
+    "best q(s_t|o_1:t)": factorised_optimum,
+    "best q(s_t|s_t-1,o_1:t)": structured_optimum,
+}
+"""The posteriors that are compared; best is by the ELBO."""
+
+
+class Identity(NamedTuple):
+    """Both sides of the identity, means over o ~ p in nats per sequence."""
+
+    gap: float
+    """log p - ELBO."""
+    smoothing: float
+    """Σ KL to the smoothing conditionals, which equals the gap."""
+    filtering: float
+    """Σ KL to the filtering posterior, the right side in the paper."""
+
+
+def identity(process: ClosedFormProcess, posterior: Conditional) -> Identity:
+    """Return both sides of the identity for a posterior."""
+    moment = process.moment()
+    gap = log_evidence(process, moment) - elbo(process, posterior, moment)
+    sums = (expected_kl(posterior, target(process), moment).item() for target in (smoothing, exact_filter))
+    return Identity(gap.item(), *sums)
 
 
 def between(first: Conditional, second: Conditional, fraction: float) -> Conditional:

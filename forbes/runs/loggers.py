@@ -2,19 +2,29 @@
 
 import inspect
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jsonargparse import Namespace
 from lightning.pytorch.cli import LightningArgumentParser
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.loggers import CometLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
+
+from forbes.errors import ForbesError
 
 __all__ = ["ParserOfRuns", "open_logger", "show_picture", "shows"]
 
 _FOLDERS = ("save_dir", "root_dir")
 """Names of the argument for a logger's folder."""
+_PACKAGES: tuple[tuple[type[Logger], tuple[str, ...], str], ...] = (
+    (TensorBoardLogger, ("tensorboard", "tensorboardX"), "'forbes[tracking]'"),
+    (WandbLogger, ("wandb",), "wandb"),
+    (MLFlowLogger, ("mlflow",), "mlflow"),
+    (CometLogger, ("comet_ml",), "comet-ml"),
+)
+"""Loggers, the modules of which they need one, and what to install."""
 
 
 class ParserOfRuns(LightningArgumentParser):
@@ -42,6 +52,13 @@ class ParserOfRuns(LightningArgumentParser):
 
 
 def _later(kind: type[Logger], **arguments: Any) -> "partial[Logger]":
+    """Return a logger to be instantiated once there is a run folder. Its package is required before there is one."""
+    for base, modules, install in _PACKAGES:
+        if issubclass(kind, base) and not any(map(find_spec, modules)):
+            raise ForbesError(
+                f"trainer.logger: {kind.__name__} needs {modules[0]}, which is not installed. Install it: "
+                f"pip install {install}"
+            )
     return partial(kind, **arguments)
 
 

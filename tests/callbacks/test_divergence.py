@@ -8,9 +8,12 @@ import signal
 
 import pytest
 import torch
+from small_agents import fit as agent_fit
+from small_agents import forbes, write_config
 from torch.optim import Adam
 
 from forbes.commands.cli import main
+from forbes.control.return_scale import ReturnScale
 from forbes.data import SequenceBatch
 from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
 from forbes.runs.folder import RunFolder, read_config, read_metrics
@@ -136,6 +139,37 @@ def test_replay_repeats_noise_batches_and_weight_of_the_kl(tiny_config, tmp_path
     assert main(["replay", str(run.failure)]) == 0
 
     assert seen[-2:] == trained
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["at once", "at the end of the epoch"])
+def test_replay_sees_running_averages_before_the_update(late, tmp_path, monkeypatch):
+    """The range of returns and the slow critic move without the optimiser; a GPU finds a divergence updates later."""
+    seen = []
+    forward = ReturnScale.forward
+
+    def remember(self, returns, valid):
+        before, scale = self.percentiles.clone(), forward(self, returns, valid)
+        seen.append((before, scale, self.percentiles.clone()))
+        return scale
+
+    monkeypatch.setattr(ReturnScale, "forward", remember)
+    broken_loss(monkeypatch, at=1)
+    if late:
+        monkeypatch.setattr("forbes.callbacks.divergence.StopAtDivergence.on_train_batch_end", lambda *_: None)
+    config = write_config(tmp_path, "dreamer")
+    config.write_text(
+        config.read_text().replace("horizon: 3", "horizon: 3\n    scale_returns: true\n    slow_critic: 0.5")
+    )
+    run = RunFolder(tmp_path / "run")
+    assert agent_fit("--config", config, "--run_dir", run) == 3
+    assert len(seen) == (4 if late else 2)
+    trained = seen[1]
+    failure = read_checkpoint(run.failure)["state_dict"]
+    assert torch.equal(failure["return_scale.percentiles"], trained[0])
+
+    assert forbes("replay", run.failure) == 0
+
+    assert all(map(torch.equal, seen[-1], trained))
 
 
 def test_replay_repeats_the_noise_and_the_rows_of_each_process(diverged, monkeypatch):

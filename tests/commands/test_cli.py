@@ -300,7 +300,9 @@ def test_a_run_folder_is_named_by_its_config_and_holds_all(tiny_config, in_tmp_p
 
     (run,) = Path("runs/tiny/forbes").iterdir()
     assert run.name.endswith("-7")
-    assert f"run folder: {run}" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert f"run folder: {run}" in output
+    assert output.endswith(f"  forbes figures elbo --runs {run}\n")
     config = yaml.safe_load((run / "config.yaml").read_text())
     assert config["seed_everything"] == 7
     assert config["model"]["class_path"] == "forbes.WorldModel"

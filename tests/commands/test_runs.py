@@ -95,6 +95,46 @@ def test_agents_have_env_steps_and_returns(tmp_path, capsys):
     assert rows(capsys)["agent"] == ["FORBES", "hike", "52,000", "52,000", "return", "612.3", "unknown"]
 
 
+def lines_of(capsys, columns=80):
+    """The lines that `forbes runs` prints, none of them wider than the terminal."""
+    assert main(["runs"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= columns
+    return lines
+
+
+@pytest.mark.parametrize("columns", [70, 80, 120, 160])
+def test_names_of_runs_are_never_folded(columns, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("forbes.commands.runs._WIDTH", columns)
+    name = "compare/cartpole/forbes_v3-0"
+    write_agent(tmp_path / "runs" / name, "dmc_cartpole_swingup_positions_only", {1000: 1.0, 52_000: 612.34})
+    write(tmp_path / "runs" / "strokes" / "rssm_wide-0", status=0)
+
+    lines = lines_of(capsys, columns)
+
+    assert sum(name in line for line in lines) == 1
+    assert sum("strokes/rssm_wide-0" in line for line in lines) == 1
+    assert any("return 612.3" in line for line in lines)
+    assert any("dmc_cartpole_swingup_positions_only" in line for line in lines) == (columns == 160)
+
+
+def test_columns_without_room_are_named(tmp_path, capsys):
+    write_agent(tmp_path / "runs" / "compare/cartpole_swingup/forbes_v3-0", "dmc_cartpole_swingup", {52_000: 612.34})
+
+    *_, last = lines_of(capsys)
+
+    assert last == "no room in 80 columns: age, seed, updates, data"
+
+
+def test_world_models_have_no_column_of_env_steps(tmp_path, capsys):
+    write(tmp_path / "runs" / "a", status=0)
+    write_agent(tmp_path / "runs" / "b", "hike", {1000: 1.0})
+
+    headers = [line for line in lines_of(capsys) if "method" in line]
+
+    assert ["env steps" in header for header in headers] == [False, True]
+
+
 def test_another_folder_or_a_run_itself_may_be_named(tmp_path, capsys):
     run = write(tmp_path / "elsewhere" / "a", status=0)
 

@@ -11,7 +11,7 @@ import torch
 from forbes.errors import ForbesError
 from forbes.evaluation import claims
 from forbes.evaluation.claims import CLAIMS, Claim, Held, decide, mean_over_seeds
-from forbes.evaluation.contrasts import contrast, entry_of, theorem_gaps
+from forbes.evaluation.contrasts import contrast, entry_of
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.metrics import score_of
 
@@ -180,13 +180,6 @@ def test_the_newest_entry_of_a_score_is_taken(recorded):
     path.write_text(json.dumps(record))
 
     assert entry_of(run, "elbo")[1]["mean"] == 7.0
-
-
-def test_theorem_1_holds_with_smoothing_and_not_with_filtering():
-    gaps = theorem_gaps()
-
-    assert max(gaps.smoothing) < 1e-12
-    assert min(gaps.filtering) > 0.1
 
 
 def test_each_claim_names_its_families_once():

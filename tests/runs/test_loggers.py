@@ -7,6 +7,7 @@ from unittest.mock import create_autospec
 
 import pytest
 import yaml
+from command_line import error_of
 from lightning.pytorch.loggers import CometLogger, LitLogger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from forbes.commands.cli import main
@@ -64,6 +65,26 @@ def test_validation_of_a_run_with_a_logger_writes_nothing(tiny_config, in_tmp_pa
     assert main(["validate", "--config", "run/config.yaml", "--ckpt_path", "run/checkpoints/last.ckpt"]) == 0
 
     assert files(".", "*") == before
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("TensorBoardLogger", "needs tensorboard, which is not installed. Install it: pip install 'forbes[tracking]'"),
+        ("WandbLogger", "needs wandb, which is not installed. Install it: pip install wandb"),
+        ("MLFlowLogger", "needs mlflow, which is not installed. Install it: pip install mlflow"),
+        ("CometLogger", "needs comet_ml, which is not installed. Install it: pip install comet-ml"),
+    ],
+)
+def test_a_logger_without_its_package_says_what_to_install(
+    name, sentence, tiny_config, in_tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("forbes.runs.loggers.find_spec", lambda module: None)
+
+    said = error_of(capsys, "fit", "--config", tiny_config, "--trainer.logger", name, "--run_dir", "run")
+
+    assert said == f"trainer.logger: {name} {sentence}"
+    assert not Path("run").exists()
 
 
 @pytest.mark.parametrize(
