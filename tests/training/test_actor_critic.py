@@ -319,9 +319,10 @@ def test_learns_the_action_that_pays(belief, trajectories):
 def test_learns_the_discrete_action_that_pays(discrete):
     """The other one of two than the last pays; straight-through gradients must know which of them was drawn."""
     number = 1 if discrete is True else 2
-    options = {"hidden_dim": 16, "mlp_dim": 16, "control_dim": 16, "horizon": 3, "discount": 0.5, "trajectories": 1}
+    options = {"control_dim": 16, "horizon": 3, "discount": 0.5, "trajectories": 1}
     rates = {"learning_rate": 1e-2, "actor_rate": 3e-3, "critic_rate": 3e-3, "discrete": discrete}
     sizes = {"observation_shape": (2 * number,), "action_dim": 2 * number, "state_dim": 2 * number}
+    sizes |= {"hidden_dim": 16 * number, "mlp_dim": 16 * number}
     ours = agent(**sizes, **options, **rates)
     train(ours, lambda update: one_of_two(16, 6, update, number))
 
