@@ -10,6 +10,7 @@ MODULES = sorted(FORBES.rglob("*.py"))
 
 FOUNDATION = [
     "errors",
+    "factors",
     "bundled",
     "files",
     "reading",

@@ -25,7 +25,7 @@ class Given(gymnasium.Env):
 
     def __init__(self, space, value, action_space=None):
         self.observation_space, self.value = space, value
-        self.action_space = action_space or spaces.Discrete(3)
+        self.action_space = spaces.Discrete(3) if action_space is None else action_space
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -48,3 +48,27 @@ class Rooms(Given):
 
 
 gymnasium.register("Toy-Rooms-v0", entry_point="toy_gymnasium:Rooms", max_episode_steps=4)
+
+
+class Levers(gymnasium.Env):
+    """Several choices at a time: each shows what was chosen, and pays if it is another than before."""
+
+    def __init__(self, action_space):
+        self.action_space = action_space
+        self.observation_space = spaces.Box(-9, 9, action_space.shape)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.last = np.zeros(self.action_space.shape, np.float32)
+        return self.last, {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        before, self.last = self.last, np.asarray(action, np.float32)
+        return self.last, float((self.last != before).mean()), False, False, {}
+
+
+for name, space in {"Levers": spaces.MultiDiscrete([3, 2]), "Buttons": spaces.MultiBinary(3)}.items():
+    gymnasium.register(
+        f"Toy-{name}-v0", entry_point="toy_gymnasium:Levers", max_episode_steps=8, kwargs={"action_space": space}
+    )

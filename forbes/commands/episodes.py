@@ -8,6 +8,7 @@ import numpy as np
 
 from forbes.data.episodes.episode import EpisodeRecord
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
+from forbes.factors import as_discrete, factor_sizes
 from forbes.figures.episodes import MAX_CHANNELS, draw_strips
 from forbes.figures.style import save_figure
 
@@ -62,7 +63,10 @@ def _facts(store: EpisodeStore, records: list[EpisodeRecord]) -> list[tuple[str,
         actions.append(episode.action[1:].copy())
     facts.append(("reward per step", _spread(np.concatenate(rewards))))
     columns = np.concatenate(actions).T  # (A, steps)
-    return facts + [(f"action {index}", _spread(column)) for index, column in enumerate(columns)]
+    sizes = factor_sizes(as_discrete(records[-1].environment["discrete"]), len(columns))
+    names = [f"{factor} = {option}" for factor, size in enumerate(sizes) for option in range(size)]
+    named = zip(names if len(sizes) > 1 else range(len(columns)), columns, strict=True)
+    return facts + [(f"action {name}", _spread(column)) for name, column in named]
 
 
 def check(path: Path) -> int:

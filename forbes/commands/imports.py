@@ -29,6 +29,7 @@ def import_(
     image: str | None = None,
     proprio: Sequence[str] | None = None,
     action: str | None = None,
+    action_sizes: Sequence[int] | None = None,
     reward: str | None = None,
     resize: int | None = None,
     fps: float | None = None,
@@ -43,6 +44,7 @@ def import_(
         image: key of the observation, if it is an image.
         proprio: keys of the observation, if it is a vector.
         action: key of the action.
+        action_sizes: number of options of each choice in a discrete action.
         reward: key of the reward.
         resize: side of the images in pixels.
         fps: steps per second to keep.
@@ -51,7 +53,8 @@ def import_(
     Raises:
         ForbesError: if an episode is damaged, or an option does not fit the data.
     """
-    source = Source(open_reader(Path(path), format), Path(path), image, proprio or (), action, reward, resize, fps)
+    recorded, keys = open_reader(Path(path), format), (image, proprio or (), action, reward)
+    source = Source(recorded, Path(path), *keys, resize, fps, action_sizes or ())
     _print(source)
     if dry_run:
         return

@@ -11,6 +11,7 @@ from torch import Tensor
 from forbes.beliefs.categorical import one_hot_of
 from forbes.control.planning import CrossEntropy, plan
 from forbes.control.policy import Actor, Policy
+from forbes.factors import Discrete, factor_sizes
 from forbes.models import Filtered, State, StateSpaceModel
 from forbes.seeding import derive_seed
 
@@ -61,6 +62,8 @@ def greedy(actor: Actor) -> ActionSelector:
 
     .. math:: a = \tfrac1K \sum_k \mathrm{mode}\,\pi(\cdot \mid f^k), \qquad
               \text{for discrete actions the one that most trajectories select}
+
+    Actions with several factors are voted on factor by factor.
     """
 
     def select_action(filtered: Filtered) -> Tensor:
@@ -82,13 +85,16 @@ def explore(actor: Actor, amount: float) -> ActionSelector:
         policy: Policy = actor(filtered.features[:, 0])
         return _agreed(policy.rsample()[0], actor.discrete)
 
-    return _epsilon_greedy(select_action, amount) if actor.discrete else noisy(select_action, amount)
+    return _epsilon_greedy(select_action, amount, actor.discrete) if actor.discrete else noisy(select_action, amount)
 
 
-def _agreed(action: Tensor, discrete: bool) -> Tensor:
-    """Return the mean of K actions, or the most frequent one, `(K, A)` to `(1, A)`."""
+def _agreed(action: Tensor, discrete: Discrete) -> Tensor:
+    """Return the mean of K actions, or the most frequent choice of each factor, `(K, A)` to `(1, A)`."""
     mean = action.mean(0, keepdim=True)  # (1, A)
-    return one_hot_of(mean.argmax(-1, keepdim=True), mean) if discrete else mean
+    if not discrete:
+        return mean
+    votes = mean.split(factor_sizes(discrete, mean.shape[-1]), -1)  # F x (1, A_f)
+    return torch.cat([one_hot_of(vote.argmax(-1, keepdim=True), vote) for vote in votes], -1)  # (1, A)
 
 
 def noisy(select_action: ActionSelector, noise: float) -> ActionSelector:
@@ -101,13 +107,14 @@ def noisy(select_action: ActionSelector, noise: float) -> ActionSelector:
     return select_nearby
 
 
-def _epsilon_greedy(select_action: ActionSelector, chance: float) -> ActionSelector:
-    """Replace a discrete action by a uniformly random one with probability `chance` (ε-greedy)."""
+def _epsilon_greedy(select_action: ActionSelector, chance: float, discrete: Discrete) -> ActionSelector:
+    """Replace a discrete action by a uniformly random one, in all its factors, with probability `chance` (ε-greedy)."""
 
     def select_or_draw(filtered: Filtered) -> Tensor:
         action = select_action(filtered)  # (1, A)
-        drawn = one_hot_of(torch.randint(action.shape[-1], (1, 1), device=action.device), action)
-        return torch.where(torch.rand(1, 1, device=action.device) < chance, drawn, action)
+        factors = action.split(factor_sizes(discrete, action.shape[-1]), -1)  # F x (1, A_f)
+        drawn = [one_hot_of(torch.randint(x.shape[-1], (1, 1), device=x.device), x) for x in factors]
+        return torch.where(torch.rand(1, 1, device=action.device) < chance, torch.cat(drawn, -1), action)
 
     return select_or_draw
 

@@ -1,6 +1,7 @@
 """Actor, critic and reward on the features of a belief sample (paper §3.2, appendix; the actor's head is Dreamer's)."""
 
 import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import torch
@@ -8,11 +9,12 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.categorical import draw_one_hot, one_hot_of
+from forbes.factors import Discrete, factor_sizes
 from forbes.models.networks import MLP
 from forbes.performance.fusion import fused
 from forbes.symlog import symexp, two_hot
 
-__all__ = ["Actor", "OneHotCategorical", "Policy", "ScalarHead", "TanhNormal", "TwoHotHead"]
+__all__ = ["Actor", "FactoredCategorical", "OneHotCategorical", "Policy", "ScalarHead", "TanhNormal", "TwoHotHead"]
 
 _MODE_SAMPLES = 100
 _LOG_2 = math.log(2.0)
@@ -94,17 +96,41 @@ class OneHotCategorical:
         return one_hot_of(self.log_probability.argmax(-1, keepdim=True), self.log_probability)
 
 
+class FactoredCategorical:
+    r"""Several choices at a time, made independently: a concatenation of one-hot vectors, one per factor.
+
+    .. math:: a = [a_1, \dots, a_F], \qquad \log p(a) = \sum_f \log p_f(a_f), \qquad H[p] = \sum_f H[p_f]
+
+    Args:
+        factors: the distributions :math:`p_f`.
+    """
+
+    def __init__(self, factors: Sequence[Policy]) -> None:
+        self.factors = factors
+
+    def rsample(self) -> tuple[Tensor, Tensor]:
+        """See `Policy.rsample`."""
+        actions, log_probs = zip(*(factor.rsample() for factor in self.factors), strict=True)
+        return torch.cat(actions, -1), torch.stack(log_probs).sum(0)  # (*, A), (*)
+
+    def mode(self) -> Tensor:
+        """See `Policy.mode`."""
+        return torch.cat([factor.mode() for factor in self.factors], -1)  # (*, A)
+
+
 class Actor(nn.Module):
     r"""The policy q(a | features), a tanh-normal of vectors, close to ±1 at initialisation (Dreamer, appendix A).
 
     .. math:: \mu = 5 \tanh(x / 5), \qquad \sigma = \mathrm{softplus}(y + \log(e^5 - 1)) + \sigma_{min}
+
+    Of discrete actions it is a `OneHotCategorical`, or with several factors a `FactoredCategorical` of them.
 
     Args:
         feature_dim: dimensions of the features, F.
         action_dim: dimensions of an action, A.
         width: width of each hidden layer.
         layers: number of hidden layers.
-        discrete: whether an action is one of A, one-hot, and the policy categorical.
+        discrete: whether an action is one of A, one-hot; or the sizes of several one-hot factors.
         min_std: :math:`\sigma_{min}`, 1e-4 in Dreamer.
     """
 
@@ -114,19 +140,21 @@ class Actor(nn.Module):
         action_dim: int,
         width: int,
         layers: int,
-        discrete: bool = False,
+        discrete: Discrete = False,
         min_std: float = 1e-4,
     ) -> None:
         super().__init__()
         self.discrete, self.min_std = discrete, min_std
+        self.sizes = factor_sizes(discrete, action_dim)
         self.hidden = MLP(feature_dim, width, layers)
         self.head = nn.Linear(width, action_dim if discrete else 2 * action_dim)
 
     def forward(self, features: Tensor) -> Policy:
         """Return the policy at features, `(*, F)`."""
         numbers: Tensor = self.head(self.hidden(features))
-        if self.discrete:
-            return OneHotCategorical(numbers)
+        if self.sizes:
+            factors = [OneHotCategorical(logits) for logits in numbers.split(self.sizes, -1)]
+            return FactoredCategorical(factors) if len(factors) > 1 else factors[0]
         return TanhNormal(*_bounded(numbers, self.min_std))
 
 

@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch, check_source
 from forbes.distributed import num_ranks, rank
 from forbes.errors import ForbesError, require_at_least
+from forbes.factors import Discrete
 
 __all__ = ["SequenceDataModule", "datamodule_of", "require_divisible"]
 
@@ -128,8 +129,8 @@ class SequenceDataModule(LightningDataModule):
         return self.source.action_dim
 
     @property
-    def discrete(self) -> bool:
-        """Whether an action is a one-hot vector."""
+    def discrete(self) -> Discrete:
+        """Kind of actions, see `Environment.discrete`."""
         return self.source.discrete
 
     def state_dict(self) -> dict[str, Any]:

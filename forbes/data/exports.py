@@ -16,6 +16,7 @@ from forbes.data.episodes.store import EpisodeStore
 from forbes.data.imports.reader import imported
 from forbes.envs.images import CHANNELS
 from forbes.errors import ForbesError
+from forbes.factors import as_discrete, factor_sizes, to_index
 from forbes.files import writing
 
 __all__ = ["export_store"]
@@ -97,7 +98,8 @@ def _minari(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
     buffer = imported("minari.data_collector.episode_buffer", "minari").EpisodeBuffer
     about, (_, first) = _environment(store), _observation(store.episode(next(iter(store.records))))
     limits = (0, 255) if first.dtype == np.uint8 else (-np.inf, np.inf)
-    actions = spaces.Discrete(about["action_dim"]) if about["discrete"] else _box(store, spaces)
+    sizes = factor_sizes(as_discrete(about["discrete"]), about["action_dim"])
+    actions = _space_of_actions(store, sizes, spaces)
     folder = (path / "data").absolute()  # the library adds a relative path to itself
     folder.mkdir(parents=True)
     observations = spaces.Box(*limits, first.shape[1:], first.dtype)
@@ -106,7 +108,9 @@ def _minari(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
     data.update_metadata({"dataset_id": data_id, "minari_version": minari.__version__})
 
     def add(number: int, episode: Episode) -> None:
-        action = episode.action[1:].argmax(1) if about["discrete"] else episode.action[1:]  # (T,) or (T, A)
+        action: NDArray[Any] = episode.action[1:]  # (T, A)
+        if sizes:
+            action = to_index(action, sizes).reshape(-1, *actions.shape)  # (T,) or (T, F)
         last = np.arange(len(action)) == len(action) - 1  # (T,)
         ends = {"terminations": last & episode.terminated, "truncations": last & (not episode.terminated)}
         observation = _observation(episode)[1]
@@ -122,8 +126,10 @@ def _environment(store: EpisodeStore) -> dict[str, Any]:
     return next(iter(store.records.values())).environment
 
 
-def _box(store: EpisodeStore, spaces: Any) -> Any:
-    """Return the space of continuous actions: [-1, 1], or unbounded if some are beyond."""
+def _space_of_actions(store: EpisodeStore, sizes: tuple[int, ...], spaces: Any) -> Any:
+    """Return the space of actions. A Box is [-1, 1], or unbounded if some are beyond."""
+    if sizes:
+        return spaces.Discrete(*sizes) if len(sizes) == 1 else spaces.MultiDiscrete(sizes)
     bounded = all(np.abs(store.episode(number).action).max() <= 1 for number in store.records)
     bound = 1.0 if bounded else np.inf
     return spaces.Box(-bound, bound, (_environment(store)["action_dim"],), np.float32)

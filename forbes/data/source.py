@@ -10,6 +10,7 @@ from torch import Tensor
 
 from forbes.choices import Split
 from forbes.errors import ForbesError
+from forbes.factors import Discrete
 from forbes.named import Named
 from forbes.seeding import generator
 from forbes.shapes import printed_by_shape
@@ -67,8 +68,8 @@ class SequenceSource(Named, ABC):
     """Shape of one observation, without batch and time."""
     action_dim: int
     """Dimension of an action, A; 0 for a process without actions."""
-    discrete: bool = False
-    """Whether an action is a one-hot vector."""
+    discrete: Discrete = False
+    """Kind of actions, see `Environment.discrete`."""
     increments: bool = False
     """Whether o_t has the pixels (0 or 1) that step t adds to an image, instead of the image itself."""
     watermark: int | None = None

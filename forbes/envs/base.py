@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.errors import ForbesError, require_at_least
+from forbes.factors import Discrete, problem_of_discrete
 from forbes.shapes import printed_by_shape
 
 __all__ = [
@@ -56,8 +57,9 @@ class Environment(ABC):
     """Shape of an observation: `(C, H, W)` for images, `(O,)` for vectors."""
     action_dim: int
     """Dimension of an action, A."""
-    discrete: bool = False
-    """Whether an action is a one-hot vector; otherwise it is any vector in [-1, 1]^A."""
+    discrete: Discrete = False
+    """False for actions that are any vector in [-1, 1]^A, True for one-hot vectors. For several choices at a time, the
+    numbers of options: with `(3, 2)` an action is a one-hot vector of 3 followed by one of 2, and A is 5."""
     action_repeat: int = 1
     """Number of simulator frames for which an action is repeated."""
 
@@ -124,8 +126,8 @@ def check_environment(environment: Environment) -> None:
     for name in ("action_dim", "action_repeat"):
         if not _is_positive_integer(value := getattr(environment, name, None)):
             raise ForbesError(f"{kind}: {name} is {value}, expected an integer above 0. Set it in the class")
-    if not isinstance(environment.discrete, bool):
-        raise ForbesError(f"{kind}: discrete is {environment.discrete}, expected true or false. Set it in the class")
+    if problem := problem_of_discrete(environment.discrete, environment.action_dim):
+        raise ForbesError(f"{kind}: {problem}. Set it in the class")
     if "task" not in (description := environment.describe()):
         raise ForbesError(f"{kind}: describe() returns {description}, expected a task. Add its name")
 

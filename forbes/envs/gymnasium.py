@@ -12,6 +12,7 @@ from forbes.envs.base import Environment, Step, repeat, require_repeat
 from forbes.envs.images import to_image
 from forbes.envs.views import VELOCITIES
 from forbes.errors import ForbesError
+from forbes.factors import discrete_of
 
 __all__ = ["Gymnasium"]
 
@@ -30,7 +31,8 @@ class Gymnasium(Environment):
     [0, 1], and text is ignored. With `pixels` the observation is the rendered image.
 
     Actions of a Box are scaled from [-1, 1] to its bounds (`scale_action`), with equal intervals for integers. Actions
-    of a Discrete are one-hot. Gymnasium's `TimeLimit` is a truncation.
+    of a Discrete are one-hot; those of a MultiDiscrete or MultiBinary have a one-hot vector for each of their choices.
+    Gymnasium's `TimeLimit` is a truncation.
 
     Args:
         task: id of the environment.
@@ -72,8 +74,9 @@ class Gymnasium(Environment):
             self._spaces.require_observations(task, self._seen)
         self._actions: Any = self._environment.action_space
         self._spaces.require_actions(task, self._actions)
-        self.discrete = type(self._actions).__name__ == "Discrete"
-        self.action_dim = int(self._actions.n) if self.discrete else int(np.prod(self._actions.shape))
+        sizes = self._spaces.factors(self._actions)
+        self.discrete = discrete_of(sizes)
+        self.action_dim = sum(sizes) or int(np.prod(self._actions.shape))
         self.observation_shape = self.reset(0).observation.shape
 
     def reset(self, seed: int) -> Step:

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from forbes.envs.base import finite_bounds, scale_action
 from forbes.envs.images import CHANNELS
 from forbes.errors import ForbesError
+from forbes.factors import to_index
 
-__all__ = ["flatten", "is_image", "require_actions", "require_observations", "sizes", "to_action"]
+__all__ = ["factors", "first_option", "flatten", "is_image", "require_actions", "require_observations", "sizes"]
+__all__ += ["to_action"]
 
 _FLAT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _REGISTER = "Wrap and register it in a module of your own, and use: gymnasium:MODULE:ID"
@@ -65,22 +67,38 @@ def require_observations(task: str, space: Any) -> None:
         raise ForbesError(f"{task}: its observations are text, expected numbers or images. {_REGISTER}")
 
 
-def require_actions(task: str, space: Any) -> None:
+def require_actions(task: str, space: Any, remedy: str = _REGISTER) -> None:
     """Raise a ForbesError unless `to_action` supports a space."""
-    if not isinstance(space, spaces.Box | spaces.Discrete):
+    if not isinstance(space, _FLAT):
         kind = type(space).__name__
-        raise ForbesError(f"{task}: its actions are a {kind}, expected a Box or a Discrete. {_REGISTER}")
+        raise ForbesError(
+            f"{task}: its actions are a {kind}, expected a Box, Discrete, MultiDiscrete or MultiBinary. {remedy}"
+        )
+
+
+def factors(space: Any) -> tuple[int, ...]:
+    """Return the number of options of each choice in an action; none for a Box."""
+    if isinstance(space, spaces.Discrete):
+        return (int(space.n),)
+    if isinstance(space, spaces.MultiDiscrete):
+        return tuple(map(int, space.nvec.ravel()))
+    return (2,) * int(np.prod(space.shape)) if isinstance(space, spaces.MultiBinary) else ()
+
+
+def first_option(space: Any) -> Any:
+    """Return the number that stands for the first option of each choice, in the shape of an action."""
+    return getattr(space, "start", 0)
 
 
 def to_action(space: Any, action: NDArray[np.float32]) -> Any:
-    r"""Return the member of a Box or Discrete for an action, float32 `(A,)` in [-1, 1] or one-hot.
+    r"""Return the member of a space for an action, float32 `(A,)` in [-1, 1] or of a one-hot vector for each choice.
 
     Real values of a Box are scaled by `scale_action`. Integers from l to h have equal intervals of [-1, 1]:
 
     .. math:: \min(h, \lfloor l + (a + 1)(h - l + 1) / 2 \rfloor)
     """
-    if isinstance(space, spaces.Discrete):
-        return space.start + action.argmax()
+    if sizes := factors(space):
+        return (to_index(action, sizes).reshape(space.shape) + first_option(space)).astype(space.dtype)  # (*space)
     low, high = finite_bounds(*_bounds(space))
     if space.dtype.kind == "f":
         scaled = scale_action(action, low, high)

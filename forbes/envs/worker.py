@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from forbes.child import start_child
 from forbes.envs.base import TIME_LIMIT, Environment, Step, check_environment, check_step
 from forbes.errors import ForbesError
+from forbes.factors import Discrete
 
 __all__ = ["BrokenEnvironmentError", "EnvironmentProcess"]
 
@@ -42,7 +43,7 @@ class _Facts(NamedTuple):
 
     observation_shape: tuple[int, ...]
     action_dim: int
-    discrete: bool
+    discrete: Discrete
     action_repeat: int
     description: dict[str, Any]
 

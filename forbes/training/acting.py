@@ -16,6 +16,7 @@ from forbes.data.episodes.episode import Episode
 from forbes.densities import log_normal
 from forbes.envs import Environment
 from forbes.errors import ForbesError, require_at_least
+from forbes.factors import Discrete, problem_of_discrete
 from forbes.models import EncodedSequence, Filtered, StateSpaceModel
 from forbes.models.networks import activate
 from forbes.training.world_model import LossTerm, WorldModel
@@ -38,7 +39,8 @@ class WorldModelAgent(WorldModel, ABC):
         two_hot: predict rewards, and values, by a categorical over fixed bins (DreamerV3), for any scale of them.
         exploration: standard deviation of the noise on the actions of collected episodes; for discrete actions the
             probability of a uniformly random one.
-        discrete: whether an action is one of A, one-hot; the command line takes it from the data.
+        discrete: whether an action is one of A, one-hot; or the sizes of several one-hot factors. The command line
+            takes it from the data.
         acting_samples: trajectories of the belief whose mean action the agent takes, K (see `Agent`); 1 in the paper.
             It can be changed after a training.
         **world: arguments of `WorldModel`.
@@ -55,7 +57,7 @@ class WorldModelAgent(WorldModel, ABC):
         reward_std: float = 1.0,
         two_hot: bool = False,
         exploration: float = 0.3,
-        discrete: bool = False,
+        discrete: Discrete = False,
         acting_samples: int = 1,
         **world: Any,
     ) -> None:
@@ -76,6 +78,8 @@ class WorldModelAgent(WorldModel, ABC):
             raise ForbesError(
                 f"{name}: the data have no actions, expected some. Choose another source, or a WorldModel"
             )
+        if problem := problem_of_discrete(discrete, self.model.action_dim):
+            raise ForbesError(f"{name}: {problem}. Use that of the data")
         self.exploration, self.discrete, self.acting_samples = exploration, discrete, acting_samples
         self.reward_std, self.reward_layers = reward_std, reward_layers
         self.scalar_head = TwoHotHead if two_hot else ScalarHead
@@ -84,7 +88,7 @@ class WorldModelAgent(WorldModel, ABC):
 
     @classmethod
     def for_data(cls, data: SequenceDataModule, **options: Any) -> Self:
-        """See `WorldModel.for_data`. Whether actions are discrete is also taken from the data."""
+        """See `WorldModel.for_data`. The kind of actions is also taken from the data."""
         return super().for_data(data, **({"discrete": data.discrete} | options))
 
     @property

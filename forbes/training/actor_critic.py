@@ -37,8 +37,8 @@ class ImaginationActorCritic(WorldModelAgent):
 
     with the features :math:`f = [h, s]`, the λ-returns V along H imagined steps from N samples of the belief at every
     step of every sequence, and :math:`w_\tau = \gamma^{\tau-1}`. The bar is a mean also over N, where the paper has a
-    sum; Adam does not depend on this factor. For discrete actions the policy is categorical, with straight-through
-    gradients.
+    sum; Adam does not depend on this factor. For discrete actions the policy is categorical, or a product of
+    categoricals, with straight-through gradients.
 
     With `continuation`, :math:`L_{model}` has the additional term :math:`-\overline{\log p(c_t \mid f_t)}`, where
     :math:`c_t` is 0 if the episode terminated in step t, else 1. The discounts are then

@@ -130,6 +130,26 @@ def test_many_trajectories_vote_for_the_discrete_action():
         np.testing.assert_array_equal(action, counts == counts.max())
 
 
+class Voters:
+    """Each of three trajectories has its own opinion on two choices, of 3 and of 2."""
+
+    discrete = (3, 2)
+
+    def __call__(self, features):
+        return self
+
+    def mode(self):
+        return torch.tensor([[1.0, 0, 0, 0, 1], [0, 0, 1, 1, 0], [0, 0, 1, 0, 1]])
+
+
+def test_every_choice_is_voted_on_by_itself():
+    model, _ = build()
+    model.action_dim = 5
+    filtered = model.filter(model.embed(torch.zeros(3, 1, 3)), torch.zeros(3, 1, 2))
+
+    assert greedy(Voters())(filtered).tolist() == [[0, 0, 1, 0, 1]]  # which none of them would take
+
+
 @pytest.mark.parametrize("trajectories", [1, 3])
 def test_every_candidate_plan_is_tried_on_a_draw_of_its_own(trajectories):
     """20 candidates take turns on the trajectories, each from (h, s) with another s of that trajectory's belief."""
@@ -187,3 +207,22 @@ def test_an_explorer_of_discrete_actions_takes_any_so_often(chance):
     assert set(map(tuple, actions)) <= {(1.0, 0.0), (0.0, 1.0)}
     expected = chance / 2
     assert abs(actions[:, 1].mean() - expected) <= 5 * (expected * (1 - expected) / 400) ** 0.5
+
+
+def test_an_explorer_of_several_choices_draws_all_of_them_at_once():
+    """Its own policy always takes (0, 0); of 2 x 3 actions any is equally probable in half of the steps."""
+    model, _ = build()
+    filtered = model.filter(model.embed(torch.zeros(1, 1, 3)), torch.zeros(1, 1, 2))
+    actor = Actor(20, 5, 8, 1, discrete=(2, 3))
+    with torch.no_grad():
+        actor.head.weight.zero_()
+        actor.head.bias.copy_(torch.tensor([50.0, -50.0, 50.0, -50.0, -50.0]))
+    torch.manual_seed(0)
+
+    actions = torch.cat([explore(actor, 0.5)(filtered) for _ in range(1200)]).detach()
+
+    cells = (actions[:, :2, None] * actions[:, None, 2:]).mean(0)  # (2, 3)
+    expected = torch.full((2, 3), 0.5 / 6)
+    expected[0, 0] += 0.5
+    assert cells.sum() == pytest.approx(1)
+    assert ((cells - expected).abs() < 5 * (expected * (1 - expected) / 1200).sqrt()).all()

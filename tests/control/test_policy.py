@@ -1,5 +1,6 @@
 """The actor's distribution against torch.distributions."""
 
+import itertools
 import math
 
 import pytest
@@ -113,7 +114,107 @@ def test_discrete_surprise_has_the_gradient_of_the_entropy():
     assert expected.abs().min() > 0.05
 
 
-@pytest.mark.parametrize("discrete", [False, True])
+SIZES = (3, 2, 2)
+
+
+def several(rows=()):
+    """A policy over three choices at a time, by an actor whose head says nothing but its bias, and their logits."""
+    actor = Actor(1, sum(SIZES), 4, 1, SIZES).double()
+    logits = torch.tensor([0.0, 1.0, -1.0, 0.5, 0.0, -1.0, 1.0], dtype=torch.float64, requires_grad=True)
+    torch.nn.init.zeros_(actor.head.weight)
+    actor.head.bias.data = logits.data
+    return actor(torch.zeros(*rows, 1, dtype=torch.float64)), actor.head.bias
+
+
+def every_action():
+    """All 12 actions, and the log-probability of each of their choices by torch.distributions."""
+    _, logits = several()
+    eyes = [torch.eye(size, dtype=torch.float64) for size in SIZES]
+    chosen = [*itertools.product(*eyes)]
+    theirs = [OneHotCategorical(logits=part.detach()) for part in logits.split(SIZES)]
+    log_probs = [[p.log_prob(x) for p, x in zip(theirs, choice, strict=True)] for choice in chosen]
+    return torch.stack([torch.cat(choice) for choice in chosen]), torch.tensor(log_probs).double(), theirs
+
+
+def p_value(action):
+    """The chi-square test of drawn actions, `(N, A)`, against the joint probabilities of all 12."""
+    actions, log_probs, _ = every_action()
+    counts = (action[:, None] == actions).all(-1).sum(0)  # (12,)
+    assert counts.sum() == len(action)
+    expected = len(action) * log_probs.sum(1).exp()
+    statistic = ((counts - expected) ** 2 / expected).sum()
+    return torch.special.gammaincc(torch.tensor(11 / 2).double(), statistic / 2)
+
+
+def test_choices_at_a_time_are_drawn_with_their_joint_probability():
+    """Of right samplers one in a million is refused, and of those whose last two choices agree too often by 4 %, fewer
+    are accepted: the statistic is λ + 11 with standard deviation √(2 (11 + 2 λ)), and the threshold 50.
+    """
+    torch.manual_seed(0)
+    action, log_prob = several((20_000,))[0].rsample()
+    every, log_probs, _ = every_action()
+
+    assert p_value(action) > 1e-6
+    which = (action[:, None] == every).all(-1).long().argmax(1)  # (N,)
+    torch.testing.assert_close(log_prob, log_probs.sum(1)[which])
+
+    joint, agree = log_probs.sum(1).exp(), every[:, 3] == every[:, 5]
+    dependent = joint + 0.02 * log_probs[:, 0].exp() * torch.where(agree, 1, -1)  # each choice has its frequency
+    noncentrality = (20_000 * (dependent - joint) ** 2 / joint).sum()
+    assert noncentrality + 11 - 5 * (2 * (11 + 2 * noncentrality)) ** 0.5 > 50
+    assert p_value(every[dependent.multinomial(20_000, replacement=True)]) < 1e-6
+
+
+def test_the_entropy_of_several_choices_is_the_sum_of_theirs():
+    """By enumeration of all actions, and so is its gradient that of the mean of -log p of the draws."""
+    _, log_probs, theirs = every_action()
+    entropy = -(log_probs.sum(1).exp() * log_probs.sum(1)).sum()
+    torch.testing.assert_close(entropy, sum(one.entropy() for one in theirs))
+
+    torch.manual_seed(0)
+    ours, logits = several((40_000,))
+    surprise = -ours.rsample()[1]
+    (gradient,) = torch.autograd.grad(surprise.mean(), logits)
+
+    assert abs(surprise.mean() - entropy) < 5 * surprise.std() / 40_000**0.5
+    same = torch.cat([one.logits for one in theirs]).requires_grad_()
+    parts = [OneHotCategorical(logits=part) for part in same.split(SIZES)]
+    (expected,) = torch.autograd.grad(sum(one.entropy() for one in parts), same)
+    assert (gradient - expected).abs().max() < 5 / 40_000**0.5  # a draw's differs by a score, onehot - p, below 1
+    assert expected.abs().max() > 0.1
+
+
+def test_gradients_of_several_choices_are_those_of_their_means():
+    """Straight-through: of any linear function of an action it is that of its mean, in each factor."""
+    torch.manual_seed(0)
+    ours, logits = several()
+    weight = torch.randn(7, dtype=torch.float64)
+
+    (gradient,) = torch.autograd.grad((weight * ours.rsample()[0]).sum(), logits)
+
+    mean = torch.cat([part.softmax(-1) for part in logits.split(SIZES)])
+    torch.testing.assert_close(gradient, torch.autograd.grad((weight * mean).sum(), logits)[0])
+
+
+def test_the_mode_of_several_choices_is_the_most_probable_of_all():
+    actions, log_probs, _ = every_action()
+
+    assert torch.equal(several()[0].mode(), actions[log_probs.sum(1).argmax()])
+
+
+def test_one_choice_is_drawn_as_before():
+    torch.manual_seed(0)
+    actor, features = Actor(6, 4, 8, 1, discrete=True), torch.randn(5, 6)
+    one, other = actor(features), policies.OneHotCategorical(actor.head(actor.hidden(features)))
+
+    torch.manual_seed(1)
+    first = one.rsample()
+    torch.manual_seed(1)
+    assert all(map(torch.equal, first, other.rsample()))
+    assert type(one) is type(other)
+
+
+@pytest.mark.parametrize("discrete", [False, True, (1, 1)])
 @pytest.mark.parametrize("shape", [(1,), (7,), (3, 4)])
 def test_shapes(shape, discrete):
     features = torch.randn(*shape, 6)

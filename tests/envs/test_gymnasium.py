@@ -1,5 +1,6 @@
 """Environments of Gymnasium: an action and a step are what Gymnasium itself makes of them."""
 
+import itertools
 import sys
 from importlib.metadata import EntryPoint
 
@@ -9,14 +10,26 @@ import pytest
 gymnasium = pytest.importorskip("gymnasium")
 
 import toy_gymnasium  # noqa: E402
-from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiDiscrete, OneOf, Sequence, Text, Tuple  # noqa: E402
+from gymnasium.spaces import (  # noqa: E402
+    Box,
+    Dict,
+    Discrete,
+    Graph,
+    MultiBinary,
+    MultiDiscrete,
+    OneOf,
+    Sequence,
+    Text,
+    Tuple,
+)
 
 from forbes.commands.cli import main  # noqa: E402
 from forbes.data import Experience  # noqa: E402
 from forbes.data.episodes.store import EpisodeStore  # noqa: E402
 from forbes.envs import Gymnasium, find_environment  # noqa: E402
-from forbes.envs.base import check_step  # noqa: E402
+from forbes.envs.base import check_environment, check_step  # noqa: E402
 from forbes.errors import ForbesError  # noqa: E402
+from forbes.factors import factor_sizes, to_one_hot  # noqa: E402
 
 
 class Camera(gymnasium.Env):
@@ -46,7 +59,7 @@ class Camera(gymnasium.Env):
 
 
 class Levers(Camera):
-    action_space = gymnasium.spaces.MultiDiscrete([2, 2])
+    action_space = gymnasium.spaces.Tuple([Discrete(2), Discrete(2)])
 
 
 def needs_another_package(render_mode=None):
@@ -125,7 +138,7 @@ def test_pixels_are_what_it_draws_made_smaller():
         ("toy_gymnasium:Toy-Room-v0", "gymnasium has no such environment. Did you mean Toy-Rooms-v0"),
         ("no_such_package:Thing-v0", "no_such_package:Thing-v0: gymnasium has no such environment"),
         ("forbes/Needy-v0", "forbes/Needy-v0: Box2D is not installed"),
-        ("forbes/Levers-v0", "its actions are a MultiDiscrete, expected a Box or a Discrete. Wrap and register it"),
+        ("forbes/Levers-v0", "its actions are a Tuple, expected a Box, Discrete, MultiDiscrete or MultiBinary. Wrap"),
     ],
 )
 def test_what_cannot_be_used_is_one_sentence(task, sentence):
@@ -178,6 +191,38 @@ def test_whole_numbers_of_a_box_are_drawn_alike(low, high, monkeypatch):
     np.testing.assert_array_equal(counts, 60)
     environment.step(np.ones(1, np.float32))
     assert environment._environment.unwrapped.taken == high
+
+
+CHOICES = {
+    "one": (Discrete(3, start=5), True),
+    "several": (MultiDiscrete([3, 2]), (3, 2)),
+    "from others than 0": (MultiDiscrete([3, 2], start=[5, -1]), (3, 2)),
+    "a table": (MultiDiscrete([[2, 3], [1, 4]]), (2, 3, 1, 4)),
+    "several of one": (MultiDiscrete([4]), True),
+    "buttons": (MultiBinary(3), (2, 2, 2)),
+    "a pad of buttons": (MultiBinary([2, 2]), (2, 2, 2, 2)),
+    "a button": (MultiBinary(1), True),
+}
+
+
+@pytest.mark.parametrize("kind", CHOICES)
+def test_every_choice_of_a_space_is_one_action(kind, monkeypatch):
+    """All of its members are reached, and none twice; the toy refuses what its space does not contain."""
+    space, discrete = CHOICES[kind]
+    environment = environment_of(monkeypatch, actions=space)
+    check_environment(environment)
+    sizes = factor_sizes(environment.discrete, environment.action_dim)
+
+    taken = []
+    for index in itertools.product(*map(range, sizes)):
+        environment.step(to_one_hot(np.array(index), sizes))
+        taken.append(environment._environment.unwrapped.taken)
+        last = np.ravel(taken[-1]) - np.ravel(getattr(space, "start", 0))
+        np.testing.assert_array_equal(last, index)
+
+    assert environment.discrete == discrete
+    assert taken[0].dtype == space.dtype
+    assert len(np.unique(np.stack(taken).reshape(len(taken), -1), axis=0)) == len(taken) == np.prod(sizes)
 
 
 @pytest.mark.parametrize("shape", [(84, 84), (84, 84, 1), (20, 30, 3), (4, 84, 84)])

@@ -315,27 +315,33 @@ def test_learns_the_action_that_pays(belief, trajectories):
     assert (action * batch.observation < 0)[clear].float().mean() > 0.9  # half of them without any learning
 
 
-def test_learns_the_discrete_action_that_pays():
+@pytest.mark.parametrize("discrete", [True, (2, 2)], ids=["one choice", "two choices"])
+def test_learns_the_discrete_action_that_pays(discrete):
     """The other one of two than the last pays; straight-through gradients must know which of them was drawn."""
-    options = {"hidden_dim": 16, "mlp_dim": 16, "control_dim": 16, "horizon": 3, "discount": 0.5, "trajectories": 1}
-    rates = {"learning_rate": 1e-2, "actor_rate": 3e-3, "critic_rate": 3e-3, "discrete": True}
-    ours = agent(observation_shape=(2,), action_dim=2, **options, **rates)
-    train(ours, lambda update: one_of_two(16, 6, update))
+    number = 1 if discrete is True else 2
+    options = {"control_dim": 16, "horizon": 3, "discount": 0.5, "trajectories": 1}
+    rates = {"learning_rate": 1e-2, "actor_rate": 3e-3, "critic_rate": 3e-3, "discrete": discrete}
+    sizes = {"observation_shape": (2 * number,), "action_dim": 2 * number, "state_dim": 2 * number}
+    sizes |= {"hidden_dim": 16 * number, "mlp_dim": 16 * number}
+    ours = agent(**sizes, **options, **rates)
+    train(ours, lambda update: one_of_two(16, 6, update, number))
 
     with torch.no_grad():
-        batch = one_of_two(100, 6, seed=-1)
+        batch = one_of_two(100, 6, -1, number)
         filtered = ours.model.filter(ours.model.embed(batch.observation), batch.action)
         action = ours.actor(filtered.features).rsample()[0]
 
-    assert ((action * batch.observation).sum(-1) == 0)[:, 1:].float().mean() > 0.9  # half without any learning
+    another = (action * batch.observation).unflatten(-1, (number, 2)).sum(-1) == 0  # (B, T, number)
+    assert (another[:, 1:].float().mean((0, 1)) > 0.9).all()  # half without any learning
 
 
-def one_of_two(batch, time, seed):
-    """One-hot actions, seen as they are: the reward is 1 for another than the last, else -1."""
+def one_of_two(batch, time, seed, number):
+    """One-hot actions, seen as they are: the reward is 1 for another than the last, else -1; of several, their sum."""
     generator = torch.Generator().manual_seed(seed)
-    action = torch.nn.functional.one_hot(torch.randint(2, (batch, time), generator=generator), 2).float()
+    choice = torch.randint(2, (batch, time, number), generator=generator)
+    action = torch.nn.functional.one_hot(choice, 2).flatten(-2).float()
     action[:, 0] = 0
-    reward = 1 - 2 * (action * action.roll(1, 1)).sum(-1)
+    reward = number - 2 * (action * action.roll(1, 1)).sum(-1)
     reward[:, :2] = 0
     return batch_of(action.clone(), action, reward)
 
@@ -416,6 +422,7 @@ def test_nothing_is_imagined_from_where_an_episode_has_ended():
         ({"actor_rate": float("nan")}, "actor_rate is nan, expected at least 0"),
         ({"reward_std": 0.0}, "reward_std is 0.0, expected a number above 0"),
         ({"action_dim": 0}, "the data have no actions"),
+        ({"action_dim": 3, "discrete": (2, 2)}, r"discrete is \(2, 2\), expected .* add up to action_dim, 3"),
     ],
 )
 def test_refuses_what_cannot_be(options, message):

@@ -200,6 +200,8 @@ def _add_imports(of_data: _Parser) -> None:
     take.add_argument("--image", metavar="KEY", help="key of the observation, if it is an image")
     take.add_argument("--proprio", metavar="KEY", nargs="+", help="keys of the observation, if it is a vector; joined")
     take.add_argument("--action", metavar="KEY", help="key of the action (default: by the format's usual name)")
+    sizes = "options of each choice in a discrete action, e.g. 3 2 (default: as the format or the values say)"
+    take.add_argument("--action-sizes", type=positive, nargs="+", metavar="N", help=sizes)
     take.add_argument("--reward", metavar="KEY", help="key of the reward (default: by the usual name, else all are 0)")
     take.add_argument("--resize", type=positive, metavar="PIXELS", help="side of the images (default: as they are)")
     take.add_argument("--fps", type=rate, help="steps per second to keep, a fraction of the data's (default: all)")

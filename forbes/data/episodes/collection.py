@@ -11,6 +11,7 @@ from forbes.data.episodes.episode import Episode, EpisodeRecord
 from forbes.data.episodes.store import EpisodeWriter
 from forbes.envs import BrokenEnvironmentError, Environment, Step
 from forbes.errors import ForbesError
+from forbes.factors import as_plain, factor_sizes, to_one_hot
 from forbes.seeding import derive_seed
 
 __all__ = [
@@ -35,10 +36,10 @@ ATTEMPTS = 3
 
 
 def random_policy(environment: Environment, seed: int) -> EpisodePolicy:
-    """Make a policy with independent uniform actions, in [-1, 1]^A or one-hot."""
+    """Make a policy with independent uniform actions, in [-1, 1]^A or with uniform choices, one-hot."""
     random, count = np.random.default_rng(seed), environment.action_dim
-    if environment.discrete:
-        return lambda _: np.eye(count, dtype=np.float32)[random.integers(count)]
+    if sizes := factor_sizes(environment.discrete, count):
+        return lambda _: to_one_hot(np.array([random.integers(size) for size in sizes]), sizes)
     return lambda _: random.uniform(-1, 1, count).astype(np.float32)
 
 
@@ -141,6 +142,6 @@ def describe_environment(environment: Environment) -> dict[str, Any]:
     return environment.describe() | {
         "observation_shape": list(environment.observation_shape),
         "action_dim": environment.action_dim,
-        "discrete": environment.discrete,
+        "discrete": as_plain(environment.discrete),
         "action_repeat": environment.action_repeat,
     }

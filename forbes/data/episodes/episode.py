@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from forbes.envs import TIME_LIMIT
 from forbes.errors import ForbesError
+from forbes.factors import as_discrete, problem_of_choices, problem_of_discrete
 from forbes.reading import is_number, readable, shortened
 from forbes.shapes import printed_by_shape
 
@@ -59,7 +60,7 @@ class Episode(NamedTuple):
     observation: NDArray[Any]
     """o_t, uint8 `(T + 1, C, H, W)` or float32 `(T + 1, O)`."""
     action: NDArray[np.float32]
-    """a_{t-1}, `(T + 1, A)`, in [-1, 1] or one-hot."""
+    """a_{t-1}, `(T + 1, A)`, in [-1, 1] or one-hot, see `Environment.discrete`."""
     reward: NDArray[np.float32]
     """r_t, `(T + 1,)`."""
     terminated: bool
@@ -84,7 +85,7 @@ _ENVIRONMENT: dict[str, Callable[[Any], bool]] = {
     "task": _FITS[str],
     "observation_shape": lambda value: type(value) is list and len(value) in (1, 3) and all(map(_is_size, value)),
     "action_dim": lambda value: _is_size(value),
-    "discrete": _FITS[bool],
+    "discrete": lambda value: type(value) is bool or (type(value) is list and all(map(_is_size, value))),
 }
 """Required fields of a record's environment, with a check of their values."""
 
@@ -161,11 +162,19 @@ def problem_of_environment(environment: dict[str, Any]) -> str:
             return f"its environment has no {name}, expected the result of `describe_environment`"
         if not fits(value := environment[name]):
             return f"its environment's {name} is {shortened(str(value), _SHOWN)}"
+    if problem := problem_of_discrete(as_discrete(environment["discrete"]), environment["action_dim"]):
+        return f"its environment's {problem}"
     return "" if type(environment.get("made_by", {})) is dict else "its environment's made_by is not a mapping"
 
 
 def problem_with(environment: dict[str, Any], episode: Episode) -> str:
-    """Return the disagreement between the recorded environment and the arrays of an episode, or an empty string."""
+    """Return the disagreement between the environment and the arrays of a new episode, or an empty string."""
+    if problem := _problem_with_shapes(environment, episode):
+        return problem
+    return problem_of_choices(episode.action, as_discrete(environment["discrete"]))
+
+
+def _problem_with_shapes(environment: dict[str, Any], episode: Episode) -> str:
     if problem := problem_of_environment(environment):
         return problem
     arrays = {"observation_shape": list(episode.observation.shape[1:]), "action_dim": episode.action.shape[1]}
@@ -293,7 +302,7 @@ def _open_episode(path: Path, record: EpisodeRecord, verified: Stamp | None) -> 
     except (KeyError, ValueError, struct.error, zipfile.BadZipFile) as error:
         raise DamagedEpisodeError(path, str(error.args[0])) from error
     episode = Episode(observation, action, reward, record.terminated, record.frames)
-    problem = (stamp != verified and problem_of(episode)) or problem_with(record.environment, episode)
+    problem = (stamp != verified and problem_of(episode)) or _problem_with_shapes(record.environment, episode)
     if not problem and len(reward) != record.steps + 1:
         problem = f"it has {len(reward) - 1} steps, expected {record.steps}"
     if problem:

@@ -17,6 +17,7 @@ from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.distributed import gathered, num_ranks, rank
 from forbes.envs import TIME_LIMIT, EnvironmentProcess, find_environment
 from forbes.errors import ForbesError
+from forbes.factors import Discrete, as_discrete
 
 __all__ = ["Experience"]
 
@@ -87,9 +88,9 @@ class Experience(SequenceSource):
         return int(self._known_shapes()["action_dim"])
 
     @property
-    def discrete(self) -> bool:  # type: ignore[override]
-        """Whether an action is a one-hot vector."""
-        return bool(self._known_shapes()["discrete"])
+    def discrete(self) -> Discrete:  # type: ignore[override]
+        """Kind of actions, see `Environment.discrete`."""
+        return as_discrete(self._known_shapes()["discrete"])
 
     def recall(self, folder: Path) -> None:
         """Read the shapes from stored episodes, if there are any, so that no environment has to be started."""

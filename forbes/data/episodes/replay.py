@@ -13,6 +13,7 @@ from forbes.data.episodes.episode import EpisodeRecord
 from forbes.data.episodes.store import EpisodeStore, first_held
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError, require_at_least
+from forbes.factors import Discrete, as_discrete
 from forbes.rounding import ceil_div
 from forbes.seeding import generator
 from forbes.shapes import printed_by_shape
@@ -120,7 +121,7 @@ class Replay(SequenceSource):
         environment = next(iter(self.store.records.values())).environment
         self.observation_shape: tuple[int, ...] = tuple(environment["observation_shape"])
         self.action_dim: int = environment["action_dim"]
-        self.discrete: bool = environment["discrete"]
+        self.discrete: Discrete = as_discrete(environment["discrete"])
 
     def refresh(self) -> None:
         """Read the index again. The episodes to sample from change only here."""

@@ -38,8 +38,11 @@ class Minari(Reader):
         if about["data_format"] == "hdf5":
             open_hdf5(self._path / "main_data.hdf5").close()
         self._data = minari.MinariDataset(self._path)
-        self._start = int(getattr(self._data.action_space, "start", 0))
-        self.action_count = getattr(self._data.action_space, "n", None)
+        from forbes.envs.gymnasium_spaces import factors, first_option, require_actions
+
+        require_actions(str(self._path), self._data.action_space, "Record a data set with one of them")
+        self.action_sizes = factors(self._data.action_space)
+        self._first_option = first_option(self._data.action_space)
 
     def __len__(self) -> int:
         return len(self._data)
@@ -54,7 +57,9 @@ class Minari(Reader):
     def read(self, number: int, keys: Collection[str]) -> Recorded:
         """Read an episode with all of its keys, which the library does not read apart."""
         episode = self._data[number]
-        actions = np.asarray(episode.actions) - self._start if self.action_count else np.asarray(episode.actions)
+        actions = np.asarray(episode.actions)
+        if self.action_sizes:
+            actions = actions - self._first_option
         values = dict(_parts(episode.observations)) | {"action": actions, "reward": episode.rewards}
         return Recorded(f"{self._path}: episode {number}", values, terminated=bool(episode.terminations[-1]))
 

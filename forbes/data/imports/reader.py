@@ -76,8 +76,8 @@ class Reader(ABC):
     """Keys that are no observations: ends, times, indices."""
     fps: float | None = None
     """Steps per second, if the format knows them."""
-    action_count: int | None = None
-    """Number of discrete actions, if the format knows it."""
+    action_sizes: tuple[int, ...] = ()
+    """Number of options of each choice in a discrete action, if the format knows it."""
     note: str = ""
     """What a user should know about this data."""
 

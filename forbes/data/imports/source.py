@@ -12,6 +12,7 @@ from forbes.data.imports.keys import choose_keys
 from forbes.data.imports.reader import Frames, Reader, Recorded
 from forbes.envs.images import to_image
 from forbes.errors import ForbesError
+from forbes.factors import are_one_hot, as_plain, described_sizes, discrete_of, to_one_hot
 from forbes.reading import readable
 
 __all__ = ["REMEDY", "SAMPLE", "Source"]
@@ -19,7 +20,7 @@ __all__ = ["REMEDY", "SAMPLE", "Source"]
 REMEDY = "Repair it or leave it out, and run the same command again"
 SAMPLE = 20
 """Number of episodes to read before an import, for ranges and to find out whether actions are one-hot."""
-_MOST = 10_000  # discrete actions; larger integers are something else
+_MOST = 10_000  # numbers of a discrete action, A; larger integers are something else
 
 
 class _Steps(NamedTuple):
@@ -50,10 +51,12 @@ class Source:
         path: file or folder, for messages and as the name of the task.
         image: key of the observation, if it is an image.
         proprio: keys of the observation, if it is a vector; several are concatenated.
-        action: key of the action. Integers become one-hot.
+        action: key of the action. Integers become one-hot vectors, one each.
         reward: key of the reward. Without one, rewards are 0.
         resize: side of the images in pixels.
         fps: steps per second to keep. The k actions of a kept step are joined, its rewards summed.
+        action_sizes: number of options of each choice in a discrete action. Default: what the format knows; of
+            integers, one more than the highest; of one-hot vectors, their length.
 
     Raises:
         ForbesError: if there are no episodes, a key is wrong, or the first episode is damaged.
@@ -69,6 +72,7 @@ class Source:
         reward: str | None = None,
         resize: int | None = None,
         fps: float | None = None,
+        action_sizes: Sequence[int] = (),
     ) -> None:
         self.reader, self.path, self.resize = reader, path, resize
         self.drops_last = False
@@ -78,7 +82,8 @@ class Source:
             self.fields = reader.fields()
         self.keys = choose_keys(str(path), reader, self.fields, image, proprio, action, reward)
         self.every = self._every(fps)
-        self.discrete, self.action_count = self._kind_of_actions()
+        self.sizes, self.counted = self._kind_of_actions(tuple(action_sizes) or reader.action_sizes)
+        self.discrete = discrete_of(self.sizes)
         if self.discrete and self.every > 1:
             raise ForbesError(f"{path}: --fps {fps} would join {self.every} discrete actions. Keep all steps")
         self.first = self.episode(0)
@@ -92,7 +97,7 @@ class Source:
             "task": self.path.resolve().name,
             "observation_shape": list(self.first.observation.shape[1:]),
             "action_dim": self.first.action.shape[1],
-            "discrete": self.discrete,
+            "discrete": as_plain(self.discrete),
             "action_repeat": self.every,
             "imported": {"format": self.reader.name, "resize": self.resize, "keys": self.keys.all()},
         }
@@ -110,7 +115,7 @@ class Source:
             found, expected = (getattr(each, name).shape[1:] for each in (episode, first))
             if not problem and found != expected:
                 problem = f"its {name} has shape {found}, expected that of the first episode, {expected}"
-        if not problem and self.discrete and not _one_hot(episode.action[1:]):
+        if not problem and self.sizes and not are_one_hot(episode.action[1:], self.sizes):
             problem = "its actions are not one-hot, but those of the first episodes are"
         if problem:
             raise ForbesError(f"{recorded.where}: {problem}. {REMEDY}")
@@ -162,7 +167,7 @@ class Source:
                 f"{recorded.where}: unequal lengths: {count} observations, {len(action)} actions, {len(reward)} "
                 f"rewards. {REMEDY}"
             )
-        if reader.actions_lead and self.action_count is None and action[0].any():
+        if reader.actions_lead and not self.counted and action[0].any():
             raise ForbesError(
                 f"{recorded.where}: its first action is not zero, expected index t to have the action that led to "
                 f"o_t. {REMEDY}"
@@ -182,43 +187,62 @@ class Source:
 
     def _vectors(self, recorded: Recorded, action: NDArray[Any]) -> NDArray[np.float32]:
         """Return actions as vectors, `(N, A)`."""
-        if self.action_count is None:
-            return _float32(action.reshape(len(action), -1))  # (N, A)
-        number = action.reshape(-1)  # (N,)
-        if number.size and not 0 <= number.min() <= number.max() < self.action_count:
+        action = action.reshape(len(action), -1)  # (N, F) or (N, A)
+        if not self.counted:
+            return _float32(action)  # (N, A)
+        if action.dtype.kind not in "biu" or action.shape[1] != len(self.sizes):
+            found = f"{action.dtype} {action.shape[1:]}"
             raise ForbesError(
-                f"{recorded.where}: its actions are {number.min()} to {number.max()}, expected 0 to "
-                f"{self.action_count - 1}. {REMEDY}"
+                f"{recorded.where}: its actions are {found}, expected {len(self.sizes)} integers. {REMEDY}"
             )
-        one_hot: NDArray[np.float32] = np.eye(self.action_count, dtype=np.float32)[number]
-        return one_hot  # (N, A)
-
-    def _kind_of_actions(self) -> tuple[bool, int | None]:
-        """Return whether actions are discrete, and their number if they are integers."""
-        shape, dtype = self.fields[self.keys.action]
-        if dtype.kind not in "iu" or np.prod(shape, dtype=int) != 1:
-            certain = slice(None) if self.reader.actions_lead else slice(-1)  # the last one may be no action
-            sample = [self._actions(number)[certain] for number in range(min(SAMPLE, len(self)))]
-            rows = [action for action in sample if len(action)]
-            discrete = bool(rows) and all(map(_one_hot, rows))
-            if dtype.kind in "iu" and not discrete:
+        for number, size in zip(action.astype(np.int64).T, self.sizes, strict=True):  # (N,)
+            if number.size and not 0 <= number.min() <= number.max() < size:
                 raise ForbesError(
-                    f"{self.path}: {self.keys.action} is {dtype} {shape}, expected one integer, a one-hot vector or "
-                    "floats. Several discrete actions are not supported"
+                    f"{recorded.where}: its actions are {number.min()} to {number.max()}, expected 0 to {size - 1}. "
+                    f"{REMEDY}"
                 )
-            return discrete, None
-        if (count := self.reader.action_count) is None:
-            count = 1 + int(max(self._actions(number).max(initial=1) for number in range(len(self))))
-        if count > _MOST:
-            raise ForbesError(
-                f"{self.path}: {self.keys.action} is an integer up to {count - 1}, expected a discrete action"
-            )
-        return True, count
+        return to_one_hot(action.astype(np.int64), self.sizes)  # (N, A)
+
+    def _kind_of_actions(self, sizes: tuple[int, ...]) -> tuple[tuple[int, ...], bool]:
+        """Return the sizes of the one-hot vectors in an action, none for vectors; and whether integers stand for them.
+
+        Args:
+            sizes: those that are known; empty if they are not.
+        """
+        where, (shape, dtype) = f"{self.path}: {self.keys.action}", self.fields[self.keys.action]
+        columns, whole = int(np.prod(shape, dtype=int)), dtype.kind in "biu"
+        if sizes:
+            if (whole and columns == len(sizes)) or columns == sum(sizes):
+                return sizes, columns != sum(sizes)
+            expected = f"{len(sizes)} integers, or {described_sizes(sizes)}"
+            raise ForbesError(f"{where} is {dtype} {shape}, expected {expected}. Change --action or --action-sizes")
+        if columns > 1 and self._seem_one_hot(columns):
+            return (columns,), False
+        if not whole:
+            return (), False
+        highest = [self._actions(number).max(0, initial=1) for number in range(len(self))]  # (F,) each
+        sizes = tuple((1 + np.max(highest, axis=0, initial=1).astype(int)).tolist())
+        if sum(sizes) > _MOST:
+            raise ForbesError(f"{where} has integers up to {max(sizes) - 1}, expected discrete actions")
+        return sizes, True
+
+    def _seem_one_hot(self, columns: int) -> bool:
+        """Return whether the actions of the first episodes are one-hot vectors."""
+        certain = slice(None) if self.reader.actions_lead else slice(-1)  # the last one may be no action
+        sample = [self._actions(number)[certain] for number in range(min(SAMPLE, len(self)))]
+        rows = [action for action in sample if len(action)]
+        return bool(rows) and all(are_one_hot(action, (columns,)) for action in rows)
 
     def _actions(self, number: int) -> NDArray[Any]:
-        """Return the actions of an episode, without the first one if it led to the first observation."""
+        """Return the actions of an episode, `(N, F)`, without the first one if it led to the first observation."""
         with readable(f"{self.path}: episode {number}", self.reader.name, REMEDY):
             action = _numbers(self._read(number, [self.keys.action]), self.keys.action)
+            action = action.reshape(len(action), -1)  # (N, F)
+        if action.shape[1:] != (np.prod(self.fields[self.keys.action].shape, dtype=int),):
+            raise ForbesError(
+                f"{self.path}: episode {number}: {self.keys.action} has {action.shape[1]} numbers a step, unlike that "
+                f"of the first episode. {REMEDY}"
+            )
         return action[1:] if self.reader.actions_lead else action
 
     def _every(self, fps: float | None) -> int:
@@ -251,9 +275,3 @@ def _float32(values: NDArray[Any]) -> NDArray[np.float32]:
 def _after_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Prepend a zero: nothing led to the first observation."""
     return np.concatenate([np.zeros_like(values[:1], shape=(1, *values.shape[1:])), values])  # (T + 1, ...)
-
-
-def _one_hot(action: NDArray[Any]) -> bool:
-    """Return whether all rows are one-hot, `(N, A)` with A > 1."""
-    pairs = action.ndim == 2 and action.shape[1] > 1 and len(action)
-    return bool(pairs and np.isin(action, (0, 1)).all() and (action.sum(1) == 1).all())

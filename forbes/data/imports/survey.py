@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from forbes.data.episodes.episode import Episode
 from forbes.data.imports.source import SAMPLE, Source
+from forbes.factors import described_sizes
 
 __all__ = ["Survey", "survey"]
 
@@ -82,8 +83,8 @@ def _alignment(source: Source) -> str:
 
 
 def _kind(source: Source, sample: Sequence[Episode]) -> str:
-    if source.discrete:
-        return "one-hot"
+    if source.sizes:
+        return described_sizes(source.sizes)
     if max(float(np.abs(episode.action).max()) for episode in sample) > 1:
         return "beyond [-1, 1] and kept as it is: an agent here would act within [-1, 1]"
     return "within [-1, 1]"

@@ -10,6 +10,7 @@ from forbes.data.episodes.collection import collect_episodes, describe_environme
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.envs import EnvironmentProcess
 from forbes.errors import ForbesError
+from forbes.factors import to_index
 
 
 def collect(path, environment, until, seed=0):
@@ -95,6 +96,27 @@ def test_the_random_policy_draws_every_action_alike():
     assert abs(values.var() - 1 / 3) < 4 * np.sqrt(4 / 45 / 2000)
     assert (chosen.sum(1) == 1).all()
     assert abs(chosen.mean(0) - 0.5).max() < 4 * 0.5 / np.sqrt(2000)
+
+
+def test_the_random_policy_makes_every_choice_by_itself():
+    """All six pairs of choices are drawn alike, within 5 standard errors of 1/6."""
+    echo = Echo()
+    echo.action_dim, echo.discrete = 5, (3, 2)
+    policy = random_policy(echo, 0)
+
+    drawn = to_index(np.array([policy(None) for _ in range(3000)]), (3, 2)) @ [2, 1]  # (N,), 0 to 5
+
+    share = np.bincount(drawn, minlength=6) / 3000
+    assert abs(share - 1 / 6).max() < 5 * np.sqrt(5 / 36 / 3000)
+
+
+def test_one_choice_is_drawn_by_the_same_random_numbers_as_ever():
+    pictures = Pictures()
+    pictures.discrete = True
+    chooser, random = random_policy(pictures, 7), np.random.default_rng(7)
+
+    for _ in range(20):
+        np.testing.assert_array_equal(chooser(None), np.eye(2, dtype=np.float32)[random.integers(2)])
 
 
 def test_the_record_says_what_the_episodes_are_of():

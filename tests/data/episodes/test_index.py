@@ -223,7 +223,7 @@ OF_ENVIRONMENT = {
     "task": [3, None],
     "observation_shape": [[], [2, 2], [-1], "2", [2.0], None, 2],
     "action_dim": [0, "1", None],
-    "discrete": [0, None],
+    "discrete": [0, None, [3, 2], [1], [], [0, 1], [True, 0], "x"],
     "made_by": ["that", None],
 }
 CHANGES = [({name: value}, name) for name, values in WRONG.items() for value in values]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from forbes.data.episodes.episode import DamagedEpisodeError, Episode, map_episode, stamp_of
+from forbes.data.episodes.replay import Replay
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter, first_held
 from forbes.errors import ForbesError
 
@@ -467,6 +468,34 @@ def test_an_environment_that_describes_too_little_is_refused(missing, store):
     with EpisodeWriter(store) as writer, pytest.raises(ForbesError, match=sentence):
         append(writer, environment=about)
     assert numbers(store) == [0, 1, 2]
+
+
+def test_choices_are_stored_with_their_sizes_and_read_back(tmp_path):
+    about, action = ENVIRONMENT | {"action_dim": 5, "discrete": (3, 2)}, np.zeros((3, 5), np.float32)
+    action[1:] = [0, 0, 1, 1, 0], [1, 0, 0, 0, 1]
+    chosen = Episode(np.zeros((3, 2), np.float32), action, np.zeros(3, np.float32), False, 2)
+    with EpisodeWriter(tmp_path) as writer:
+        assert writer.append(chosen, 0, "test", about).environment["discrete"] == [3, 2]
+        writer.append(chosen, 0, "test", about | {"discrete": [3, 2]})
+        for wrong, sentence in (
+            (about | {"discrete": True}, r"its action at step 1 is .*, expected a one-hot vector\. Fix"),
+            (about | {"discrete": (2, 3)}, "its action at step 1 is .*, expected one-hot vectors of 2 and 3 numbers"),
+            (
+                about | {"discrete": (3, 3)},
+                r"its environment's discrete is \(3, 3\), expected .* action_dim, 5",
+            ),
+            (about | {"discrete": (4, 1)}, "its action at step 1 is"),
+        ):
+            with pytest.raises(ForbesError, match=sentence):
+                writer.append(chosen, 0, "test", wrong)
+        other = action.copy()
+        other[1:] = [1, 0, 1, 1, 0]
+        with pytest.raises(ForbesError, match=r"has episodes whose discrete is \[3, 2\], not \[2, 1, 2\]"):
+            writer.append(chosen._replace(action=other), 0, "test", about | {"discrete": [2, 1, 2]})
+
+    replay = Replay(str(tmp_path), hold_out=0)
+    assert (replay.discrete, replay.action_dim) == ((3, 2), 5)
+    np.testing.assert_array_equal(EpisodeStore(tmp_path).episode(1).action, action)
 
 
 @pytest.mark.parametrize(("name", "value"), [("observation_shape", [3]), ("action_dim", 2)])

@@ -110,12 +110,24 @@ def test_an_import_continues_after_the_damaged_file_is_repaired(tmp_path):
     assert len(EpisodeStore(tmp_path / "store").records) == 4
 
 
-def test_several_discrete_actions_are_refused(tmp_path):
+def test_integers_that_are_no_choices_are_refused(tmp_path):
     path = recordings.write("dreamer", tmp_path / "recorded", recordings.episodes(2))
-    for file in path.iterdir():
-        rewrite(file, action=np.tile([[0, 2]], (5, 1)), state=np.ones(5), reward=None, is_first=None, is_terminal=None)
+    rest = {"state": np.ones(5), "reward": None, "is_first": None, "is_terminal": None}
 
-    assert "Several discrete actions are not supported" in sentence_of(path, tmp_path / "store")
+    def refused(action, **options):
+        for file, values in zip(sorted(path.iterdir()), action, strict=True):
+            rewrite(file, action=values, **rest)
+        return sentence_of(path, tmp_path / "store", **options)
+
+    pair, negative = np.tile([[0, 2]], (5, 1)), np.tile([[0, -1]], (5, 1))
+    assert "its actions are -1 to -1, expected 0 to 1" in refused([negative, negative])
+    assert "action has integers up to 9998, expected discrete actions" in refused([pair, pair + 9996])
+    assert "its actions are 2 to 2, expected 0 to 1" in refused([pair, pair], action_sizes=[3, 2])
+    assert "action is int64 (2,), expected 1 integers, or a one-hot vector" in refused([pair, pair], action_sizes=[3])
+    assert "action has 3 numbers a step, unlike that of the first episode" in refused(
+        [pair, np.tile([[0, 2, 0]], (5, 1))]
+    )
+    assert "its actions are float64 (2,), expected 2 integers" in refused([pair, pair / 2])
 
 
 def test_images_of_floats_are_refused(tmp_path):

@@ -19,6 +19,7 @@ from forbes.data.imports.importing import import_episodes, is_imported, partial_
 from forbes.data.imports.source import SAMPLE, Source
 from forbes.data.imports.survey import survey
 from forbes.errors import ForbesError
+from forbes.factors import factor_sizes, to_one_hot
 
 
 def source(path, **options):
@@ -127,7 +128,7 @@ def test_memory_is_that_of_an_episode(tmp_path):
 
 
 @pytest.mark.parametrize("images", [False, True], ids=["vectors", "images"])
-@pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
+@pytest.mark.parametrize("discrete", [False, True, (2, 1)], ids=["continuous", "discrete", "choices"])
 @pytest.mark.parametrize("name", EXPORTS)
 def test_an_exported_store_is_imported_bit_for_bit(name, discrete, images, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # a relative path, as one types it
@@ -138,7 +139,9 @@ def test_an_exported_store_is_imported_bit_for_bit(name, discrete, images, tmp_p
     with EpisodeWriter(tmp_path / "store") as writer:
         for episode in recordings.episodes(4, images=images):
             steps = len(episode.reward) - 1
-            action = np.eye(3)[random.integers(3, size=steps)] if discrete else random.uniform(-1, 1, (steps, 3))
+            action = random.uniform(-1, 1, (steps, 3))
+            if sizes := factor_sizes(discrete, 3):
+                action = to_one_hot(np.stack([random.integers(size, size=steps) for size in sizes], 1), sizes)
             action = np.concatenate([np.zeros((1, 3)), action]).astype(np.float32)
             observation = episode.observation
             if images:
@@ -149,7 +152,8 @@ def test_an_exported_store_is_imported_bit_for_bit(name, discrete, images, tmp_p
     store = EpisodeStore(tmp_path / "store")
 
     assert list(export_store(store, exported, name)) == [0, 1, 2]
-    found = source(exported)
+    known = isinstance(discrete, bool) or name == "minari"
+    found = source(exported, action_sizes=() if known else discrete)
 
     assert (found.discrete, len(found)) == (discrete, 3)
     for number, ours in zip(store.records, map(found.episode, range(3)), strict=True):
@@ -172,6 +176,55 @@ def test_integers_become_one_hot_actions(tmp_path):
     assert found.discrete
     np.testing.assert_array_equal(found.episode(2).action, [[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0]])
     assert not found.episode(2).reward.any()
+
+
+@pytest.mark.parametrize("dtype", [np.int64, bool])
+def test_several_integers_become_one_hot_vectors_side_by_side(dtype, tmp_path):
+    (tmp_path / "recorded").mkdir()
+    action = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype)
+    for number in range(2):
+        np.savez(tmp_path / "recorded" / f"{number}.npz", state=np.ones((4, 2)), action=action)
+    found, wider = source(tmp_path / "recorded"), source(tmp_path / "recorded", action_sizes=[3, 2])
+
+    assert (found.discrete, wider.discrete) == ((2, 2), (3, 2))
+    np.testing.assert_array_equal(found.episode(0).action, [[0, 0, 0, 0], [0, 1, 1, 0], [0, 1, 0, 1], [1, 0, 0, 1]])
+    np.testing.assert_array_equal(wider.episode(0).action[1], [0, 1, 0, 1, 0])
+    assert "one-hot vectors of 2 and 2 numbers, one after the other" in survey(found).facts["action"]
+    assert len(imported(tmp_path / "recorded", tmp_path / "store")) == 2
+    assert is_imported(found, tmp_path / "store")
+
+
+@pytest.mark.parametrize("kind", ["several", "buttons", "nested"])
+def test_choices_of_a_minari_data_set_have_its_sizes(kind, tmp_path, monkeypatch):
+    minari, spaces = pytest.importorskip("minari"), pytest.importorskip("gymnasium").spaces
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    space = {
+        "several": spaces.MultiDiscrete([3, 2], start=[5, -1]),
+        "buttons": spaces.MultiBinary(2),
+        "nested": spaces.Tuple([spaces.Discrete(2), spaces.Discrete(2)]),
+    }[kind]
+    action = np.array([[0, 0], [1, 1], [0, 1]])
+    recorded = {"several": action + np.array([5, -1]), "buttons": action.astype(np.int8), "nested": tuple(action.T)}[
+        kind
+    ]
+    episode = EpisodeBuffer(
+        0, None, None, np.zeros((4, 2), np.float32), recorded, [0.0] * 3, [False] * 3, [False] * 2 + [True]
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that nobody is named as author
+        minari.create_dataset_from_buffers(
+            "lab/toy-v0", [episode], action_space=space, observation_space=spaces.Box(-9, 9, (2,))
+        )
+
+    if kind == "nested":
+        with pytest.raises(ForbesError, match="its actions are a Tuple, expected a Box, Discrete, MultiDiscrete or"):
+            source(tmp_path / "lab/toy-v0")
+        return
+    found = source(tmp_path / "lab/toy-v0")
+    assert found.discrete == ((3, 2) if kind == "several" else (2, 2))
+    np.testing.assert_array_equal(found.episode(0).action[1:], to_one_hot(action, found.sizes))
 
 
 def test_an_episode_of_one_step_leaves_actions_one_hot(tmp_path):
