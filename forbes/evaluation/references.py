@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from forbes.data import SequenceDataModule, Split, Strokes
+from forbes.data import SequenceData, Split, Strokes
 from forbes.evaluation.ngram import fit_ngrams
 from forbes.models import Likelihood, Normal
 from forbes.seeding import forked
@@ -24,7 +24,7 @@ _EXAMPLES, _ROWS = 500, 50
 """Number of training sequences in the mean frame, and number of sequences decoded at a time."""
 
 
-def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
+def references(data: SequenceData, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
     """Return log p of each step of the first `count` sequences in nats, float64 `(N, T)`, by name; 0 on padding."""
     if isinstance(data.source, Strokes):
         ngrams = fit_ngrams(data.source, data.length)
@@ -35,7 +35,7 @@ def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, c
     return {}
 
 
-def reference_means(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, float]:
+def reference_means(data: SequenceData, likelihood: Likelihood, split: Split, count: int) -> dict[str, float]:
     """Return the mean of log p over the first `count` sequences, in nats per sequence, by name; empty if count is 0."""
     found = references(data, likelihood, split, count) if count else {}
     return {name: values.sum(1).mean().item() for name, values in found.items()}
@@ -48,7 +48,7 @@ def lowest_above(score: float, means: Mapping[str, float]) -> str | None:
 
 
 @torch.no_grad()
-def _still_pictures(data: SequenceDataModule, likelihood: Normal, split: Split, count: int) -> dict[str, Tensor]:
+def _still_pictures(data: SequenceData, likelihood: Normal, split: Split, count: int) -> dict[str, Tensor]:
     total, steps = torch.zeros(data.observation_shape, dtype=torch.float64), 0
     for index in torch.arange(min(_EXAMPLES, data.source.size("train"))).split(_ROWS):
         batch = data.sequences("train", index)
