@@ -12,7 +12,8 @@ from small_strokes import write_config, write_strokes
 from forbes.commands.cli import main
 from forbes.data.strokes.file import StrokeArrays
 from forbes.runs import configuration, modules
-from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
+from forbes.runs.saving import AtomicCheckpointIO
 
 SLOW = ("commands", "callbacks", "runs", "faults", "test_contributing.py", "test_full_disk.py", "test_damaged_files.py")
 """Folders and files of tests that go through the command line: `pytest -m "not slow"` leaves them out."""

@@ -14,9 +14,10 @@ from forbes.data.strokes.file import load_strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.published import published_curves
 from forbes.evaluation.record import read_arrays, read_record
-from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import read_config, read_metrics
 from forbes.runs.provenance import read_provenance
+from forbes.runs.saving import AtomicCheckpointIO
 
 __all__ = ["KINDS", "TYPES", "damaged", "read_or_sentence"]
 

@@ -11,8 +11,8 @@ from forbes.commands.cli import main
 from forbes.data.episodes.store import EpisodeWriter
 from forbes.errors import ForbesError
 from forbes.files import locked, no_link, replace_file
-from forbes.runs.checkpoint import AtomicCheckpointIO
 from forbes.runs.metrics_log import JsonLinesLogger
+from forbes.runs.saving import AtomicCheckpointIO
 
 PRECIOUS = "precious, and without an end of line"
 

@@ -29,9 +29,10 @@ from forbes.evaluation.record import write_record
 from forbes.evaluation.scoring import PartialScores
 from forbes.figures.style import save_figure
 from forbes.files import append_whole, locked, replace_file
-from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import read_metrics
 from forbes.runs.metrics_log import JsonLinesLogger
+from forbes.runs.saving import AtomicCheckpointIO
 
 LIMIT = 4000  # bytes of a file: more than an episode below, less than the index of ten
 ENVIRONMENT = {"task": "Counting", "observation_shape": [2], "action_dim": 1, "discrete": False}
@@ -215,7 +216,8 @@ from pathlib import Path
 from test_full_disk import append_episodes, left_whole, log_metrics
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.errors import ForbesError
-from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
+from forbes.runs.saving import AtomicCheckpointIO
 
 disk, said = Path(sys.argv[1]), []
 AtomicCheckpointIO().save_checkpoint({"number": 0}, disk / "last.ckpt")

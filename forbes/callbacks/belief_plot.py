@@ -15,10 +15,11 @@ from matplotlib.transforms import blended_transform_factory
 from torch import Tensor
 
 from forbes.beliefs import BeliefHead
-from forbes.callbacks.picture import PictureCallback, colour_of, require_state
+from forbes.callbacks.picture import PictureCallback, require_state
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import first_of_each_class
+from forbes.figures.prediction_grid import colour_of
 from forbes.figures.style import BLACK, GREY, PAGE, density_map, paper_style
 from forbes.models import StateSpaceModel
 from forbes.training.world_model import WorldModel

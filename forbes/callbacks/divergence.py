@@ -11,8 +11,8 @@ from torch import Tensor
 
 from forbes.data.datamodule import datamodule_of
 from forbes.rounding import ceil_div
-from forbes.runs.checkpoint import AtomicCheckpointIO
 from forbes.runs.folder import RunFolder
+from forbes.runs.saving import AtomicCheckpointIO
 from forbes.training.divergence import DivergedError, hold_unless_finite
 
 __all__ = ["StopAtDivergence"]

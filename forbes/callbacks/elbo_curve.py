@@ -1,18 +1,23 @@
 """Plot the bound and its parts during training."""
 
-import pandas as pd
+from typing import TYPE_CHECKING
+
 import torch
 from lightning import Trainer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.callbacks.picture import PictureCallback, colour_of
+from forbes.callbacks.picture import PictureCallback
 from forbes.data import SequenceDataModule
 from forbes.evaluation.references import reference_means
+from forbes.figures.prediction_grid import colour_of
 from forbes.figures.style import BLACK, GREY, PAGE, draw_references, paper_style, show_settled
 from forbes.runs.folder import read_metrics
 from forbes.training.world_model import WorldModel
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["ElboCurve"]
 
@@ -71,7 +76,7 @@ class ElboCurve(PictureCallback):
         return kl.nanmean(0), spread / count.sqrt()  # (T,), (T,)
 
 
-def _draw_curves(axes: Axes, metrics: pd.DataFrame, name: str, colour: str) -> None:
+def _draw_curves(axes: Axes, metrics: "pd.DataFrame", name: str, colour: str) -> None:
     """Draw one metric for both splits."""
     curves = []
     for split, label, of_split in [("train", "train", GREY), ("val", "validation", colour)]:

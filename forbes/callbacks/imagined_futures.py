@@ -3,11 +3,12 @@
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.callbacks.picture import PictureCallback, colour_of, require_context, require_frames, shown_sequences
+from forbes.callbacks.picture import PictureCallback, require_context, require_frames, shown_sequences
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import complete
 from forbes.figures import imagination
+from forbes.figures.prediction_grid import colour_of
 from forbes.training.world_model import WorldModel
 
 __all__ = ["ImaginedFutures"]

@@ -14,10 +14,9 @@ from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.data.datamodule import datamodule_of
 from forbes.errors import ForbesError, require_at_least
 from forbes.evaluation.predictions import first_of_each_class
-from forbes.evaluation.runs import model_name
 from forbes.figures.grids import require_images
-from forbes.figures.style import method_styles, save_figure
-from forbes.models import BeliefModel, StateSpaceModel
+from forbes.figures.style import save_figure
+from forbes.models import StateSpaceModel
 from forbes.runs.loggers import show_picture, shows
 from forbes.seeding import derive_seed, forked
 from forbes.training.world_model import WorldModel
@@ -25,7 +24,6 @@ from forbes.training.world_model import WorldModel
 __all__ = [
     "FileCallback",
     "PictureCallback",
-    "colour_of",
     "require_context",
     "require_frames",
     "require_state",
@@ -112,12 +110,6 @@ def shown_sequences(data: SequenceDataModule, count: int, module: LightningModul
     else:
         batch = data.sequences("train", data.source.latest(count))
     return batch.to(module.device)
-
-
-def colour_of(model: BeliefModel) -> str:
-    """Return the colour of a model's family, which all figures share."""
-    name = model_name(model)
-    return method_styles([name])[name].colour
 
 
 def require_context(callback: Callback, trainer: Trainer, context: int) -> None:

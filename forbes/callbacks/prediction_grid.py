@@ -3,15 +3,14 @@
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.callbacks.picture import PictureCallback, colour_of, require_context, require_frames
-from forbes.data import SequenceBatch, SequenceDataModule
+from forbes.callbacks.picture import PictureCallback, require_context, require_frames
+from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
-from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
-from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
-from forbes.models import BeliefModel
+from forbes.evaluation.predictions import first_of_each_class, whole_sequences
+from forbes.figures.prediction_grid import prediction_grid
 from forbes.training.world_model import WorldModel
 
-__all__ = ["PredictionGrid", "prediction_grid"]
+__all__ = ["PredictionGrid"]
 
 
 class PredictionGrid(PictureCallback):
@@ -44,25 +43,3 @@ class PredictionGrid(PictureCallback):
         """Draw the digits and their completions."""
         batch = whole_sequences(data, "validation", first_of_each_class(data, "validation", self.digits))
         return prediction_grid(module.model, data, batch.to(module.device), self.context, self.samples)
-
-
-def prediction_grid(
-    model: BeliefModel, data: SequenceDataModule, batch: SequenceBatch, context: int, samples: int
-) -> Figure:
-    """Draw sequences of images and sampled completions, at the training length and at the end of the longest.
-
-    Args:
-        model: model on the batch's device.
-        data: data of the sequences.
-        batch: B sequences of at least the training length.
-        context: number of frames that the model sees.
-        samples: number of completions, N, from torch's global generator.
-    """
-    times = sorted({data.length, batch.observation.shape[1]})
-    completions = complete(model, data.source, batch, context, samples)
-    colour = colour_of(model)
-    sampled = [
-        Panel(f"sampled completions, t = {time}", completions.at(time).transpose(0, 1), colour) for time in times
-    ]
-    pictures = data.source.pictures(batch.observation)
-    return draw_panels([truth_panel(pictures, times[::-1]), seen_panel(pictures, context), *sampled])

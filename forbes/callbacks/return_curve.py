@@ -1,6 +1,7 @@
 """Plot the returns of an agent during training."""
 
-import pandas as pd
+from typing import TYPE_CHECKING
+
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
@@ -8,10 +9,12 @@ from forbes.callbacks.collect import require_agent
 from forbes.callbacks.picture import PictureCallback
 from forbes.data import Experience, SequenceDataModule
 from forbes.data.datamodule import datamodule_of
-from forbes.evaluation.published import published_curves
 from forbes.figures.returns import return_curve
 from forbes.runs.folder import read_metrics
 from forbes.training.world_model import WorldModel
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["ReturnCurve"]
 
@@ -46,8 +49,10 @@ class ReturnCurve(PictureCallback):
         task, published = self._published(data)
         return return_curve(read_metrics(self.folder), task, published)
 
-    def _published(self, data: SequenceDataModule) -> tuple[str, dict[str, list[pd.Series]]]:
+    def _published(self, data: SequenceDataModule) -> "tuple[str, dict[str, list[pd.Series]]]":
         """Return the task, and its published curves."""
+        from forbes.evaluation.published import published_curves  # imports pandas
+
         source = data.source
         assert isinstance(source, Experience)
         return source.task, published_curves(self.reference, source.task)

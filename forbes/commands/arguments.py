@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 from forbes.choices import LONGEST
 from forbes.errors import ForbesError
 
-__all__ = ["ArgumentParser", "RunsParser", "add_models", "positive", "rate", "seconds"]
+__all__ = ["ArgumentParser", "RunsParser", "add_models", "existing_run", "positive", "rate", "seconds"]
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -27,7 +27,7 @@ class RunsParser(ArgumentParser):
 
     def __init__(self, prog: str, description: str, runs: str) -> None:
         super().__init__(prog, description)
-        self.add_argument("runs", nargs="*", metavar="RUN", help=runs)
+        self.add_argument("runs", nargs="*", metavar="RUN", type=existing_run, help=runs)
         add_models(self)
 
     def parse_args(self, *arguments: Any) -> argparse.Namespace:  # type: ignore[override]  # of its overloads, ours
@@ -54,6 +54,18 @@ def add_models(parser: argparse._ActionsContainer) -> None:
         metavar="DATA",
         help="data of --model: a configuration or a run folder (default: those of the first RUN)",
     )
+
+
+def existing_run(text: str) -> str:
+    """Return the name of a run folder that exists (an argparse type), so that a wrong one is reported at once.
+
+    Raises:
+        ForbesError: if there is no such folder.
+    """
+    from forbes.runs.folder import RunFolder  # imports numpy, which help pages do not need
+
+    RunFolder.existing(text)
+    return text
 
 
 def positive(text: str) -> int:

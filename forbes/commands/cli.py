@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from forbes import __version__
+from forbes.commands.arguments import existing_run
 from forbes.commands.parsers.fit import DESCRIPTION, help_page
 from forbes.errors import FULL, ForbesError, unwritable
 
@@ -123,7 +124,8 @@ def _run(arguments: list[str]) -> int:
         if (page := _asked_help(name, rest)) is not None:
             print(page, end="")
             return 0
-    else:  # help and wrong arguments are reported before anything heavy is imported
+        _require_configurations(rest)
+    else:  # help and wrong arguments, like a missing run folder, are reported before anything heavy is imported
         if name != "evaluate":
             _require_one_process(name)
         _parser(name).parse_args(list(itertools.takewhile("--".__ne__, rest)))
@@ -137,6 +139,19 @@ def _require_one_process(name: str) -> None:
     processes = int(os.environ.get("WORLD_SIZE", 1)) if "TORCHELASTIC_RUN_ID" in os.environ else 1
     if processes > 1:
         raise ForbesError(f"forbes {name}: uses one process, but torchrun started {processes}. Leave torchrun out")
+
+
+def _require_configurations(arguments: Sequence[str]) -> None:
+    """Report a configuration, or a run to resume, that does not exist, before anything heavy is imported.
+
+    Other wrong options need the signatures of the classes that they belong to.
+    """
+    from forbes.runs.configs import with_config_paths
+
+    with_config_paths(arguments)
+    for flag, run in itertools.pairwise(arguments):
+        if flag == "--resume" and not run.endswith(".ckpt"):  # a checkpoint is refused as such
+            existing_run(run)
 
 
 def _asked_help(name: str, arguments: list[str]) -> str | None:

@@ -6,15 +6,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from forbes.callbacks.prediction_grid import prediction_grid
 from forbes.commands.parsers.complete import parser
-from forbes.data import SequenceDataModule
+from forbes.data import SequenceData
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import first_of_each_class, whole_sequences
+from forbes.evaluation.runs import open_model
 from forbes.figures.grids import require_images
+from forbes.figures.prediction_grid import prediction_grid
 from forbes.figures.style import save_figure
 from forbes.seeding import forked
-from forbes.training.loading import load_run
 
 __all__ = ["main"]
 
@@ -24,15 +24,15 @@ _DRAWN = 10  # sequences, unless they are named
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
-    world, data = load_run(args.run)
+    model, data, *_ = open_model(args.run)
     batch = whole_sequences(data, args.split, _index(args, data))
     with forked("cpu", args.seed):
-        figure = prediction_grid(world.model, data, batch, args.context, args.samples)
+        figure = prediction_grid(model, data, batch, args.context, args.samples)
     save_figure(figure, args.output)
     print(args.output)
 
 
-def _index(args: Any, data: SequenceDataModule) -> Tensor:
+def _index(args: Any, data: SequenceData) -> Tensor:
     """Return the sequences to draw, `(B,)`, int64; refuse data that cannot be drawn."""
     require_images(args.run, data.observation_shape, "Name a run on images")
     if args.context >= data.length:

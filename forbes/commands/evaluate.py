@@ -14,7 +14,6 @@ from torch import Tensor
 from forbes.choices import PASSES, SUBSET, Split
 from forbes.commands.parsers.evaluate import parser
 from forbes.commands.tables import (
-    print_agents,
     print_degradation,
     print_images,
     print_pairs,
@@ -24,7 +23,6 @@ from forbes.commands.tables import (
 from forbes.data import Simulated
 from forbes.errors import ForbesError
 from forbes.evaluation.adapters import adapter_folder, load_all
-from forbes.evaluation.agents import evaluate_agents, is_agent
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.image_scores import futures_of, image_curves, image_rows, score_images
 from forbes.evaluation.metrics import SCORES, EvaluatedRun, compare_pairs, record_differences
@@ -36,6 +34,7 @@ from forbes.evaluation.runs import (
     data_name,
     data_sha256,
     find_device,
+    is_agent,
     require_comparable,
     split_batches,
 )
@@ -78,6 +77,9 @@ def _main(argv: Sequence[str]) -> None:
             raise ForbesError(f"{args.runs[0]}: an agent is evaluated by its return, a --model has none. Name others")
         if num_from_torchrun() > 1:
             raise ForbesError(f"{args.runs[0]}: one process plays the episodes of an agent. Leave torchrun out")
+        from forbes.commands.agent_tables import print_agents  # imports Lightning
+        from forbes.evaluation.agents import evaluate_agents
+
         device = find_device(args.device)
         played = evaluate_agents(folders, args.episodes, args.acting_samples, args.seed, device, command)
         return print_agents(played)

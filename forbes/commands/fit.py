@@ -33,7 +33,7 @@ from forbes.commands.parsers.fit import DESCRIPTION, run_options
 from forbes.commands.trainer_arguments import require_processes, require_usable
 from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
-from forbes.runs.checkpoint import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.config_errors import building, one_sentence, raised_inside, said_by_lightning
 from forbes.runs.configs import with_config_paths
 from forbes.runs.configuration import (
@@ -47,10 +47,12 @@ from forbes.runs.folder import RunFolder, experiment_name
 from forbes.runs.launched import EndTogether, chosen_by_first, is_first, launched_devices, lost_process
 from forbes.runs.loggers import ParserOfRuns, open_logger, shows
 from forbes.runs.metrics_log import JsonLinesLogger, MarkStart
-from forbes.runs.modules import check_weights, weights_of
 from forbes.runs.progress import progress
-from forbes.runs.provenance import RecordRun, read_provenance
+from forbes.runs.provenance import read_provenance
+from forbes.runs.recorded import RecordRun
+from forbes.runs.saving import AtomicCheckpointIO, ResumeWholeEpochs, SaveLast
 from forbes.runs.stop import StopOnSignal
+from forbes.runs.worlds import check_weights, weights_of
 from forbes.training.divergence import DivergedError
 
 __all__ = ["fit", "predict", "test", "validate"]

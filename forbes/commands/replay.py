@@ -16,7 +16,8 @@ from forbes.errors import ForbesError
 from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.configuration import allow_modules
 from forbes.runs.folder import RunFolder
-from forbes.runs.modules import build_run, check_weights
+from forbes.runs.modules import build_run
+from forbes.runs.worlds import check_weights
 from forbes.training.known_belief import KnownBelief
 from forbes.training.world_model import WorldModel
 

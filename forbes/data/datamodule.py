@@ -8,10 +8,10 @@ from lightning import LightningDataModule, Trainer
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch, check_source
+from forbes.data.sequences import SequenceData
+from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.distributed import num_ranks, rank
-from forbes.errors import ForbesError, require_at_least
-from forbes.factors import Discrete
+from forbes.errors import ForbesError
 
 __all__ = ["SequenceDataModule", "datamodule_of", "require_divisible"]
 
@@ -76,7 +76,7 @@ def datamodule_of(trainer: Trainer) -> "SequenceDataModule":
     return data
 
 
-class SequenceDataModule(LightningDataModule):
+class SequenceDataModule(SequenceData, LightningDataModule):
     """Batches of `SequenceBatch` from a source; images stay uint8 until they are on the device.
 
     Training batch i is a pure function of (seed, i). A resumed run continues with the batch it would have had, and no
@@ -101,38 +101,6 @@ class SequenceDataModule(LightningDataModule):
         torch.Size([4, 30, 1, 28, 28])
     """
 
-    def __init__(
-        self,
-        source: SequenceSource,
-        batch_size: int = 50,
-        length: int = 50,
-        updates_per_epoch: int = 100,
-        seed: int = 0,
-        validation_sequences: int = 1000,
-    ) -> None:
-        super().__init__()
-        sizes = {"batch_size": batch_size, "length": length, "updates_per_epoch": updates_per_epoch}
-        require_at_least(1, "SequenceDataModule", **sizes, validation_sequences=validation_sequences)
-        check_source(source)
-        self.source, self.batch_size, self.length, self.seed = source, batch_size, length, seed
-        self.updates_per_epoch = updates_per_epoch
-        self.validation_sequences = validation_sequences
-
-    @property
-    def observation_shape(self) -> tuple[int, ...]:
-        """Shape of one observation."""
-        return self.source.observation_shape
-
-    @property
-    def action_dim(self) -> int:
-        """Dimension of an action, A."""
-        return self.source.action_dim
-
-    @property
-    def discrete(self) -> Discrete:
-        """Kind of actions, see `Environment.discrete`."""
-        return self.source.discrete
-
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a checkpoint: the number of episodes of a growing source."""
         return {} if self.source.watermark is None else {"watermark": self.source.watermark}
@@ -140,10 +108,6 @@ class SequenceDataModule(LightningDataModule):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the source to the episodes it had at the checkpoint."""
         self.source.watermark = state_dict["watermark"]
-
-    def train_index(self, number: int) -> Tensor:
-        """Return the indices of training batch `number`, `(B,)`, int64."""
-        return self.source.train_index(self.batch_size, self.length, self.seed, number)
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Return `updates_per_epoch` batches, starting after the batches already trained on."""
@@ -163,16 +127,7 @@ class SequenceDataModule(LightningDataModule):
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> SequenceBatch:
         """Decode a batch on the device."""
-        return self._decode(batch)
-
-    def sequences(self, split: Split, index: Tensor, length: int | None = None) -> SequenceBatch:
-        """Return sequences of a split by index on the CPU, cut or padded to `length` (default: that of the module)."""
-        return self._decode(self.source.gather(split, index, length or self.length))
-
-    def _decode(self, compact: Any) -> SequenceBatch:
-        batch = self.source.decode(compact)
-        check_batch(self.source, batch)
-        return batch
+        return self.decode(batch)
 
     def _ordered(self, split: Split, limit: int | None) -> DataLoader[Any]:
         size = self.source.size(split)

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torch.distributions import Normal as Gaussian
 
-from forbes.data import SequenceDataModule, Split
+from forbes.data import SequenceData, Split
 from forbes.errors import ForbesError
 from forbes.models import (
     BeliefModel,
@@ -50,7 +50,7 @@ _UNITS: dict[int, dict[str, Likelihood]] = {
 
 
 @torch.no_grad()
-def check_model(model: BeliefModel, data: SequenceDataModule, where: str, needs: Sequence[str] = ()) -> None:
+def check_model(model: BeliefModel, data: SequenceData, where: str, needs: Sequence[str] = ()) -> None:
     """Check a model in eval mode on the first sequences of its data.
 
     Args:

@@ -13,13 +13,12 @@ import torch
 import yaml
 from torch import nn
 
-from forbes.data import SequenceDataModule
+from forbes.data import SequenceData
 from forbes.errors import ForbesError
 from forbes.evaluation.adapter_checks import check_model
 from forbes.evaluation.runs import TrainedRun, load_runs
 from forbes.models import BeliefModel
 from forbes.reading import shortened
-from forbes.runs.modules import build_data
 
 __all__ = ["adapter_folder", "load_adapter", "load_all"]
 
@@ -50,13 +49,19 @@ def load_all(
         raise ForbesError("--model: on which data? Name a run first, or a configuration: --data strokes/forbes")
     runs = load_runs(paths, device)
     if models:
-        source = runs[0].data if data is None else build_data(data)
+        source = runs[0].data if data is None else _data(data)
         runs += [load_adapter(words, source, device, needs) for words in models]
     return runs
 
 
+def _data(where: str) -> SequenceData:
+    from forbes.runs.modules import build_data  # imports Lightning
+
+    return build_data(where)
+
+
 def load_adapter(
-    words: Sequence[str], data: SequenceDataModule, device: str = "cpu", needs: Sequence[str] = ()
+    words: Sequence[str], data: SequenceData, device: str = "cpu", needs: Sequence[str] = ()
 ) -> TrainedRun:
     """Load and check one model: its module, from the current folder or as installed, its class and its arguments."""
     name = shortened(" ".join(words), 120)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from forbes.data import Experience
 from forbes.data.episodes.collection import describe_environment, episode_seed
 from forbes.data.episodes.episode import Episode
 from forbes.envs import Environment, EnvironmentProcess
@@ -24,9 +23,9 @@ from forbes.pomdps import Process
 from forbes.runs.provenance import origin
 from forbes.seeding import derive_seed
 from forbes.training.acting import WorldModelAgent, play_measured
-from forbes.training.loading import load_run, loaded_agent
+from forbes.training.loading import loaded_agent
 
-__all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "is_agent", "play_test_episode"]
+__all__ = ["DISTANCES", "REWARD", "PlayedAgent", "evaluate_agents", "play_test_episode"]
 __all__ += ["seed_of_test_episode", "summarise_agents"]
 
 DISTANCES = ("prior_non_gaussianity", "posterior_non_gaussianity")
@@ -65,14 +64,6 @@ class PlayedAgent(NamedTuple):
     environment: dict[str, Any]
     checkpoint: str
     """SHA-256 of the evaluated checkpoint."""
-
-
-def is_agent(run: str) -> bool:
-    """Return whether a run folder holds an agent, which is evaluated by its returns."""
-    module, data = load_run(run)
-    if isinstance(data.source, Experience):
-        data.source.close()
-    return isinstance(module, WorldModelAgent)
 
 
 def evaluate_agents(

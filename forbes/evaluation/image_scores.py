@@ -13,17 +13,18 @@ the belief; the open-loop log-likelihood is.
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
-from torchmetrics import MetricCollection
-from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMeasure
 
 from forbes.data import SequenceBatch, SequenceSource
 from forbes.evaluation.predictions import expected_frames
 from forbes.models import BeliefModel
 from forbes.seeding import derive_seed, forked
+
+if TYPE_CHECKING:
+    from torchmetrics import MetricCollection
 
 __all__ = ["ImageScores", "futures_of", "image_curves", "image_rows", "score_images"]
 
@@ -97,7 +98,9 @@ def image_curves(found: Mapping[str, ImageScores]) -> Iterator[tuple[str, str, d
             )
 
 
-def _update(metrics: list[MetricCollection], kinds: list[str], predicted: Tensor, truth: Tensor, mask: Tensor) -> None:
+def _update(
+    metrics: list["MetricCollection"], kinds: list[str], predicted: Tensor, truth: Tensor, mask: Tensor
+) -> None:
     """Add predictions `(B, H, C, H, W)` of the steps that count, bool `(B, H)`, to the metrics of each horizon."""
     for horizon in range(int(mask.any(0).sum())):
         if horizon == len(metrics):
@@ -106,12 +109,15 @@ def _update(metrics: list[MetricCollection], kinds: list[str], predicted: Tensor
         metrics[horizon].update(predicted[rows, horizon].float(), truth[rows, horizon])
 
 
-def _metrics(kinds: list[str]) -> MetricCollection:
+def _metrics(kinds: list[str]) -> "MetricCollection":
+    from torchmetrics import MetricCollection  # only where images are scored: it imports scipy.signal
+    from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMeasure
+
     of_kind = {"psnr": PeakSignalNoiseRatio, "ssim": StructuralSimilarityIndexMeasure}
     return MetricCollection({kind: of_kind[kind](data_range=1.0) for kind in kinds})
 
 
-def _computed(metrics: list[MetricCollection]) -> ImageScores:
+def _computed(metrics: list["MetricCollection"]) -> ImageScores:
     computed = [{kind: value.item() for kind, value in cast(Any, each).compute().items()} for each in metrics]
     ssim = [values["ssim"] for values in computed if "ssim" in values]
     return ImageScores([values["psnr"] for values in computed], ssim or None)

@@ -5,13 +5,14 @@ No model is loaded, so runs can be drawn while they train, or where their checkp
 
 import re
 from collections.abc import Collection, Sequence
-from typing import Any, NamedTuple
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from forbes.errors import ForbesError
 from forbes.runs.folder import RunFolder, read_config, read_metrics
 from forbes.runs.naming import class_of, method_of, part_of, task_of, with_suffix, without_seed
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["LAYERS", "TRAJECTORIES", "RecordedRun", "group_by_method", "read_run", "returns_of"]
 
@@ -111,7 +112,7 @@ def _folder(path: str) -> str:
     return folder.parent.name if re.match(r"\d{8}-\d{6}-", folder.name) else re.sub(r"-\d+$", "", folder.name)
 
 
-def returns_of(run: RecordedRun) -> pd.Series:
+def returns_of(run: RecordedRun) -> "pd.Series":
     """Return the returns of an agent without exploration, indexed by env steps.
 
     Raises:

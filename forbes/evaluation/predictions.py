@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Split, Strokes
+from forbes.data import SequenceBatch, SequenceData, SequenceSource, Split, Strokes
 from forbes.errors import ForbesError
 from forbes.models import BeliefModel, EncodedSequence, Rollout, State, StateSpaceModel
 from forbes.shapes import printed_by_shape
@@ -175,7 +175,7 @@ def open_loop_frames(model: StateSpaceModel, batch: SequenceBatch, context: int)
     return model.likelihood.mean(model.decode(features))
 
 
-def whole_sequences(data: SequenceDataModule, split: Split, index: Tensor) -> SequenceBatch:
+def whole_sequences(data: SequenceData, split: Split, index: Tensor) -> SequenceBatch:
     """Return sequences up to the end of the longest one, with at least the data module's own length."""
     length = data.length
     while (batch := data.sequences(split, index, length)).mask[:, -1].any():
@@ -184,7 +184,7 @@ def whole_sequences(data: SequenceDataModule, split: Split, index: Tensor) -> Se
     return batch.first(last)  # (B, last, ...)
 
 
-def first_of_each_class(data: SequenceDataModule, split: Split, count: int) -> Tensor:
+def first_of_each_class(data: SequenceData, split: Split, count: int) -> Tensor:
     """Return indices of the first sequence of each class, then the second of each, …: `(count,)`, int64.
 
     Without classes, return the first indices of the split.

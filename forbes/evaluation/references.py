@@ -20,7 +20,7 @@ from collections.abc import Iterator, Mapping
 import torch
 from torch import Tensor
 
-from forbes.data import SequenceBatch, SequenceDataModule, Simulated, Split, Strokes
+from forbes.data import SequenceBatch, SequenceData, Simulated, Split, Strokes
 from forbes.evaluation.ngram import fit_ngrams
 from forbes.models import Likelihood, Normal, SymlogNormal, VectorNormal
 from forbes.seeding import forked
@@ -33,7 +33,7 @@ _NAMES = {3: ("mean frame", "last frame"), 1: ("mean observation", "last observa
 """Names of the constant predictions by rank of the observation."""
 
 
-def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
+def references(data: SequenceData, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
     """Return log p of each step of the first `count` sequences in nats, float64 `(N, T)`, by name; 0 on padding."""
     known = isinstance(data.source, Simulated)
     if isinstance(likelihood, Normal | VectorNormal | SymlogNormal) and not known:  # densities, also of strokes
@@ -45,7 +45,7 @@ def references(data: SequenceDataModule, likelihood: Likelihood, split: Split, c
     return {}
 
 
-def reference_means(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, float]:
+def reference_means(data: SequenceData, likelihood: Likelihood, split: Split, count: int) -> dict[str, float]:
     """Return the mean of log p over the first `count` sequences, in nats per sequence, by name; empty if count is 0."""
     found = references(data, likelihood, split, count) if count else {}
     return {name: values.sum(1).mean().item() for name, values in found.items()}
@@ -58,7 +58,7 @@ def lowest_above(score: float, means: Mapping[str, float]) -> str | None:
 
 
 @torch.no_grad()
-def _predictions(data: SequenceDataModule, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
+def _predictions(data: SequenceData, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
     """Return log p of each step by the mean, by the previous observation, and of vectors by the best linear map."""
     mean = _mean_target(data, likelihood)  # (*O)
     weight = _least_squares(data, likelihood) if likelihood.rank == 1 else None  # (P, O)
@@ -76,12 +76,12 @@ def _predictions(data: SequenceDataModule, likelihood: Likelihood, split: Split,
     return {name: torch.cat(parts) for name, parts in found.items()}  # (N, T)
 
 
-def _train(data: SequenceDataModule) -> Iterator[SequenceBatch]:
+def _train(data: SequenceData) -> Iterator[SequenceBatch]:
     for index in torch.arange(min(_EXAMPLES, data.source.size("train"))).split(_ROWS):
         yield data.sequences("train", index)
 
 
-def _mean_target(data: SequenceDataModule, likelihood: Likelihood) -> Tensor:
+def _mean_target(data: SequenceData, likelihood: Likelihood) -> Tensor:
     """Return the mean over all steps of training sequences, `(*O)`."""
     total, steps = torch.zeros(data.observation_shape, dtype=torch.float64), 0
     for batch in _train(data):
@@ -90,7 +90,7 @@ def _mean_target(data: SequenceDataModule, likelihood: Likelihood) -> Tensor:
     return (total / max(steps, 1)).float()  # (*O)
 
 
-def _least_squares(data: SequenceDataModule, likelihood: Likelihood) -> Tensor:
+def _least_squares(data: SequenceData, likelihood: Likelihood) -> Tensor:
     """Return (A_1, A_2, B, c) transposed, float64 `(P, O)`, by the normal equations of training sequences."""
     products: list[Tensor] = []
     for batch in _train(data):

@@ -9,15 +9,17 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
+import forbes
 from forbes.beliefs import FlowBelief, GaussianBelief
-from forbes.data import SequenceBatch, SequenceDataModule, Split
+from forbes.data import Experience, SequenceBatch, SequenceData, Split
 from forbes.errors import ForbesError
 from forbes.models import BeliefModel, StateSpaceModel
+from forbes.runs.folder import RunFolder, read_config
 from forbes.runs.naming import with_suffix, without_seed
-from forbes.training.loading import open_run
+from forbes.runs.worlds import LoadedWorld, is_world, open_world
 
 __all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "method_name", "model_name"]
-__all__ += ["require_comparable", "run_titles", "split_batches"]
+__all__ += ["is_agent", "open_model", "require_comparable", "run_titles", "split_batches"]
 
 _PUBLISHED: dict[type[nn.Module], str] = {GaussianBelief: "RSSM", FlowBelief: "FORBES"}
 """Published names of the models whose name differs from their class."""
@@ -29,7 +31,7 @@ class TrainedRun(NamedTuple):
     path: str
     """Path as the user typed it."""
     model: BeliefModel
-    data: SequenceDataModule
+    data: SequenceData
     checkpoint: str
     """SHA-256 of the checkpoint that the model was loaded from."""
     config: dict[str, Any]
@@ -100,10 +102,41 @@ def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
     """Load runs, with their models on `device`."""
     runs = []
     for path in paths:
-        module, data, config, checkpoint = open_run(path)
+        model, data, config, checkpoint = open_model(path)
         sections = {key: without_seed(config[key]) for key in ("model", "data")}
-        runs.append(TrainedRun(path, module.model.to(device), data, checkpoint, sections))
+        runs.append(TrainedRun(path, model.to(device), data, checkpoint, sections))
     return runs
+
+
+def is_agent(run: str) -> bool:
+    """Return whether a run folder holds an agent, which is evaluated by its returns."""
+    config = read_config(RunFolder.trained(run).config)
+    if is_world(config):
+        return False
+    from forbes.training.acting import WorldModelAgent  # imports Lightning
+    from forbes.training.loading import load_run
+
+    module, _, name = config["model"]["class_path"].rpartition(".")
+    if module == "forbes" and isinstance(kind := getattr(forbes, name, None), type):
+        return issubclass(kind, WorldModelAgent)
+    found, data = load_run(run)
+    if isinstance(data.source, Experience):
+        data.source.close()
+    return isinstance(found, WorldModelAgent)
+
+
+def open_model(run: Path | str) -> LoadedWorld:
+    """Load the model of a run, on the CPU in evaluation mode. Only runs of other classes than ours import Lightning.
+
+    Raises:
+        ForbesError: as `load_run`.
+    """
+    if loaded := open_world(run):
+        return loaded
+    from forbes.training.loading import open_run  # imports Lightning
+
+    module, data, config, checkpoint = open_run(run)
+    return LoadedWorld(module.model, data, config, checkpoint)
 
 
 def _kind(model: BeliefModel) -> type[nn.Module]:
@@ -115,19 +148,19 @@ def _kind(model: BeliefModel) -> type[nn.Module]:
 
 
 def split_batches(
-    data: SequenceDataModule, split: Split, sequences: int, batch_size: int
+    data: SequenceData, split: Split, sequences: int, batch_size: int
 ) -> Iterator[tuple[int, SequenceBatch]]:
     """Yield the first `sequences` sequences of a split in order, as batches with the index of their first sequence."""
     for index in torch.arange(sequences).split(batch_size):
         yield int(index[0]), data.sequences(split, index)
 
 
-def data_name(data: SequenceDataModule) -> str:
+def data_name(data: SequenceData) -> str:
     """Return a name for the data: the source with its arguments, and the length."""
     return f"{data.source}, {data.length} steps"
 
 
-def data_sha256(data: SequenceDataModule, split: Split, sequences: int) -> str:
+def data_sha256(data: SequenceData, split: Split, sequences: int) -> str:
     """Hash the first `sequences` sequences of a split, as the model sees them."""
     digest = hashlib.sha256()
     for _, batch in split_batches(data, split, sequences, batch_size=500):

@@ -19,7 +19,7 @@ from rich.progress import Progress
 from torch import Tensor
 
 from forbes.choices import PASSES, SUBSET
-from forbes.data import SequenceBatch, SequenceDataModule, Split
+from forbes.data import SequenceBatch, SequenceData, Split
 from forbes.distributed import num_ranks, of_all_ranks, rank
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
@@ -110,7 +110,7 @@ def make_scorer(name: str, number: int, batch_size: int, context: int) -> Scorer
 
 def evaluate(
     model: BeliefModel,
-    data: SequenceDataModule,
+    data: SequenceData,
     scores: Sequence[str] = ("elbo", "pll"),
     split: Split = "test",
     sequences: int = SUBSET,

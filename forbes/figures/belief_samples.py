@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from forbes.data import SequenceBatch, SequenceDataModule, Simulated
+from forbes.data import SequenceBatch, SequenceData, Simulated
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import filter
 from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, load_runs, method_name, run_titles
@@ -31,7 +31,7 @@ class KnownSamples(NamedTuple):
     """The belief of a `KnownBelief` over the state itself, named after the method that has its family."""
 
     name: str
-    data: SequenceDataModule
+    data: SequenceData
     module: KnownBelief
     label: str = "state"
     """Name of the values that the belief is over."""
@@ -56,7 +56,7 @@ class WorldSamples(NamedTuple):
     """The belief of a world model, over the observation without noise, E[o_t | h_t, s_t]."""
 
     name: str
-    data: SequenceDataModule
+    data: SequenceData
     process: Process
     model: StateSpaceModel
     label: str = "observation without noise"
@@ -144,7 +144,7 @@ def _sensor(process: Process, state: Tensor) -> DiagonalGaussian:
     return emission
 
 
-def _require_same(runs: Sequence[str], data: Sequence[SequenceDataModule]) -> None:
+def _require_same(runs: Sequence[str], data: Sequence[SequenceData]) -> None:
     hashes = [data_sha256(one, "test", min(_COMPARED, one.source.size("test"))) for one in data]
     for run, one, sha256 in zip(runs, data, hashes, strict=True):
         if sha256 != hashes[0]:

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.data import SequenceDataModule
+from forbes.data import SequenceData
 from forbes.errors import ForbesError
 from forbes.evaluation.belief_errors import belief_errors, moment_matched
 from forbes.figures.belief_samples import LearnedSamples, exact_belief, known_beliefs, world_models
@@ -82,7 +82,7 @@ def _learned(runs: Sequence[str]) -> Sequence[LearnedSamples]:
     return known_beliefs(runs) if all(known) else world_models(runs)
 
 
-def _index(data: SequenceDataModule, index: Sequence[int]) -> int:
+def _index(data: SequenceData, index: Sequence[int]) -> int:
     size = data.source.size("test")
     if len(index) > 1 or not 0 <= index[0] < size:
         found = " ".join(map(str, index))
@@ -90,7 +90,7 @@ def _index(data: SequenceDataModule, index: Sequence[int]) -> int:
     return index[0]
 
 
-def least_gaussian(data: SequenceDataModule, process: Process) -> int:
+def least_gaussian(data: SequenceData, process: Process) -> int:
     """Return the test sequence, of the first 200, whose exact beliefs are farthest from Gaussians.
 
     The distance is the forward KL of the Gaussian with the same mean and variance, in nats, summed over the steps.

@@ -1,15 +1,17 @@
 """Figure 5 of the paper: the ELBO against updates."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import pandas as pd
 from matplotlib.figure import Figure
 
 from forbes.evaluation.references import reference_means
 from forbes.evaluation.runs import load_runs
 from forbes.figures.families import group, require_same_data
 from forbes.figures.style import COLUMN, Method, draw_range, draw_references, paper_style, show_settled
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["FamilyCurves", "draw_elbo", "elbo_against_updates"]
 
@@ -21,7 +23,7 @@ class FamilyCurves(NamedTuple):
     style: Method
     bound: str
     """Name of the training bound, e.g. `elbo[S=1]`."""
-    curves: Sequence[pd.Series]
+    curves: "Sequence[pd.Series]"
     """The bound on the validation split against updates, one curve per run."""
     tests: Sequence[float]
     """Test ELBO of each evaluated run, if the ELBO is the training bound."""
@@ -51,6 +53,8 @@ def elbo_against_updates(families: Sequence[FamilyCurves], references: Mapping[s
     A family trained with another bound is drawn with that bound, and the legend then names all bounds. Dotted lines are
     the `references` on the validation split, by name.
     """
+    import pandas as pd
+
     bounds = {family.bound for family in families}
     with paper_style():
         figure = Figure((COLUMN, 2.3), layout="constrained")

@@ -1,9 +1,7 @@
 """Group runs into families, and read what their folders have recorded."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
-
-import pandas as pd
+from typing import TYPE_CHECKING, NamedTuple
 
 from forbes.errors import ForbesError
 from forbes.evaluation.record import read_record
@@ -11,6 +9,9 @@ from forbes.evaluation.runs import TrainedRun, data_sha256, require_comparable, 
 from forbes.figures.style import Method, method_styles
 from forbes.models import BeliefModel
 from forbes.runs.folder import read_metrics
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["RunFamily", "group", "require_same_data"]
 
@@ -35,7 +36,7 @@ class RunFamily(NamedTuple):
         """Name, with the number of runs if there are several."""
         return self.name if len(self.runs) == 1 else f"{self.name}, {len(self.runs)} runs"
 
-    def curves(self) -> list[pd.Series]:
+    def curves(self) -> "list[pd.Series]":
         """Return the training bound of each run on the validation split, indexed by update."""
         return [_curve(run) for run in self.runs]
 
@@ -68,7 +69,7 @@ def require_same_data(runs: Sequence[TrainedRun]) -> None:
     require_comparable(runs, [data_sha256(run.data, "test", count) for run, count in zip(runs, counts, strict=True)])
 
 
-def _curve(run: TrainedRun) -> pd.Series:
+def _curve(run: TrainedRun) -> "pd.Series":
     metrics = read_metrics(run.path)
     name = f"val/{run.model.bound_name}"
     if name not in metrics:

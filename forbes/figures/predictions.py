@@ -6,7 +6,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Strokes
+from forbes.data import SequenceBatch, SequenceData, SequenceSource, Strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.adapters import load_all
 from forbes.evaluation.digits.neighbours import TrainingPrefixes, last_frame
@@ -67,7 +67,7 @@ def draw_predictions(
     }
 
 
-def _chosen(data: SequenceDataModule, index: Sequence[int], context: int) -> Tensor:
+def _chosen(data: SequenceData, index: Sequence[int], context: int) -> Tensor:
     """Return the test sequences to draw, by a rule that does not depend on any model."""
     size = data.source.size("test")
     for value in index:
@@ -113,7 +113,7 @@ def predictions(
     return draw_panels(panels)
 
 
-def ambiguous_digits(data: SequenceDataModule, context: int, candidates: int = 500, neighbours: int = 50) -> Tensor:
+def ambiguous_digits(data: SequenceData, context: int, candidates: int = 500, neighbours: int = 50) -> Tensor:
     """Return test digits with an ambiguous beginning, independent of any model: `(classes,)`, int64.
 
     For each class it is the digit among the first `candidates` whose nearest training digits, by the blurred frame

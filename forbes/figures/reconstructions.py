@@ -6,7 +6,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.data import Experience, Replay, SequenceBatch, SequenceDataModule, SequenceSource, Split
+from forbes.data import Experience, Replay, SequenceBatch, SequenceData, SequenceSource, Split
 from forbes.errors import ForbesError
 from forbes.evaluation.methods import group_by_method, read_run
 from forbes.evaluation.predictions import complete
@@ -66,7 +66,7 @@ def _shown(run: TrainedRun, index: Sequence[int], context: int) -> SequenceBatch
     rows = source.latest(source.size(split)) if split == "train" else torch.arange(source.size(split))
     if not all(0 <= value < len(rows) for value in index):
         raise ForbesError(f"--index: {run.path} has {len(rows)} sequences to draw, expected 0 to {len(rows) - 1}")
-    batch = SequenceDataModule(source, length=run.data.length, batch_size=1).sequences(split, rows[list(index)])
+    batch = SequenceData(source, length=run.data.length, batch_size=1).sequences(split, rows[list(index)])
     batch = batch.first(int(batch.mask.sum(1).max()))  # (B, T, ...)
     if not 0 < context < batch.observation.shape[1]:
         steps = batch.observation.shape[1]

@@ -1,18 +1,21 @@
 """Plot the returns of one agent during its training, with published curves for comparison."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from forbes.figures.style import BLACK, COLUMN, GREY, draw_range, method_styles, method_title, paper_style
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 __all__ = ["join_seeds", "return_curve"]
 
 
-def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Sequence[pd.Series]]) -> Figure:
+def return_curve(metrics: "pd.DataFrame", task: str, published: "Mapping[str, Sequence[pd.Series]]") -> Figure:
     """Draw the return without exploration, and that of the collected episodes, against env steps.
 
     Args:
@@ -36,8 +39,10 @@ def return_curve(metrics: pd.DataFrame, task: str, published: Mapping[str, Seque
     return figure
 
 
-def join_seeds(curves: Sequence[pd.Series]) -> pd.DataFrame:
+def join_seeds(curves: "Sequence[pd.Series]") -> "pd.DataFrame":
     """Interpolate the curves of all seeds to common steps, one column each."""
+    import pandas as pd
+
     return pd.concat(curves, axis=1).sort_index().interpolate("index", limit_area="inside").dropna()
 
 

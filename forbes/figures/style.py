@@ -6,16 +6,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import matplotlib as mpl
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from forbes.errors import ForbesError
 from forbes.files import replace_file
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "METHODS", "ORANGE", "PAGE", "PALETTE", "Method"]
 __all__ += ["density_map", "draw_range", "draw_references", "method_styles", "method_title", "paper_style"]
@@ -167,7 +169,7 @@ def density_map(colour: str) -> LinearSegmentedColormap:
     return LinearSegmentedColormap.from_list("density", ["white", colour])
 
 
-def draw_range(axes: Axes, runs: pd.DataFrame, method: Method, label: str) -> None:
+def draw_range(axes: Axes, runs: "pd.DataFrame", method: Method, label: str) -> None:
     """Draw mean and range of several runs, one column each, against the index."""
     axes.fill_between(runs.index, runs.min(axis=1), runs.max(axis=1), color=method.colour, alpha=0.2, lw=0)
     marker = method.marker if len(runs) == 1 else ""  # a line of one point would be invisible
@@ -201,7 +203,7 @@ def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", 
     return True
 
 
-def show_settled(axes: Axes, curves: Sequence[pd.Series]) -> None:
+def show_settled(axes: Axes, curves: "Sequence[pd.Series]") -> None:
     """Set the y limits of an axis of curves to the range after their first quarter, in which they change fast."""
     first = 0.25 * max(curve.index.max() for curve in curves)
     settled = [value for curve in curves for value in curve[curve.index >= first]]

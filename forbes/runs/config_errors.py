@@ -12,11 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from lightning import Callback, LightningDataModule, LightningModule, Trainer
-from lightning.pytorch.loggers import Logger
 from torch import nn
 
-from forbes.data import SequenceDataModule, SequenceSource
+from forbes.data import SequenceSource
 from forbes.errors import ForbesError
 from forbes.reading import shortened
 
@@ -25,8 +23,6 @@ __all__ = ["building", "one_sentence", "raised_inside", "said_by_lightning"]
 _LENGTH = 200  # characters of a message; the libraries' own may contain a whole configuration
 
 TOP_LEVEL = ("model", "data", "trainer", "seed_everything", "config", "ckpt_path")
-SECTIONS = {"data.source": SequenceSource, "data": SequenceDataModule, "trainer": Trainer, "model": LightningModule}
-CONFIGURABLE = (nn.Module, LightningDataModule, SequenceSource, Callback, Logger)
 
 
 class _Complaint(NamedTuple):
@@ -88,7 +84,7 @@ def _unknown_option(match: re.Match[str], message: str, keys: list[str]) -> _Com
     if owners:
         owner, valid = owners[-1].rpartition(".")[2], list(inspect.signature(pydoc.locate(owners[-1])).parameters)  # type: ignore[arg-type]
     elif path[0] == "trainer":
-        owner, valid = "Trainer", list(inspect.signature(Trainer).parameters)
+        owner, valid = "Trainer", list(inspect.signature(_sections()["trainer"]).parameters)
     else:
         return _Complaint(path[0], f"the configuration has no such option{_nearest_of_all(path[0])}")
     return _Complaint(".".join(path), f"{owner} has no such option{_nearest(path[-1], valid)}")
@@ -117,9 +113,18 @@ _RULES: tuple[tuple[str, Callable[[re.Match[str], str, list[str]], _Complaint]],
 """Patterns in the messages of jsonargparse 4.53, and the functions that explain them."""
 
 
+def _sections() -> dict[str, type]:
+    """Return the class of each section of a configuration."""
+    from lightning import LightningModule, Trainer
+
+    from forbes.data import SequenceDataModule
+
+    return {"data.source": SequenceSource, "data": SequenceDataModule, "trainer": Trainer, "model": LightningModule}
+
+
 def _nearest_of_all(option: str) -> str:
     """Suggest the nearest option of the whole configuration, by its last part."""
-    places = {name: f"{section}.{name}" for section, kind in SECTIONS.items() for name in _arguments(kind)}
+    places = {name: f"{section}.{name}" for section, kind in _sections().items() for name in _arguments(kind)}
     places |= {name: name for name in TOP_LEVEL}
     near = difflib.get_close_matches(option, places, n=1)
     return f", did you mean {places[near[0]]}?" if near else _nearest(option, TOP_LEVEL)
@@ -133,7 +138,10 @@ def _arguments(kind: type) -> set[str]:
 
 def _class_names() -> set[str]:
     """Return the names of the classes that a configuration may use."""
-    found = _derived(CONFIGURABLE)
+    from lightning import Callback, LightningDataModule
+    from lightning.pytorch.loggers import Logger
+
+    found = _derived((nn.Module, LightningDataModule, SequenceSource, Callback, Logger))
     return {kind.__name__ for kind in found if kind.__module__.split(".")[0] != "torch" and kind.__name__[0] != "_"}
 
 

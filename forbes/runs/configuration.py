@@ -4,27 +4,23 @@ import importlib
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jsonargparse import Namespace, set_parsing_settings
-from lightning import Callback, LightningDataModule, LightningModule
-from lightning.fabric.plugins import CheckpointIO, ClusterEnvironment, Precision
-from lightning.pytorch.accelerators import Accelerator
-from lightning.pytorch.cli import LightningArgumentParser
-from lightning.pytorch.loggers import Logger
-from lightning.pytorch.plugins import LayerSync
-from lightning.pytorch.profilers import Profiler
-from lightning.pytorch.strategies import Strategy
+from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 from torch import nn
 
 import forbes
-from forbes.data import SequenceDataModule, SequenceSource
+from forbes.data import SequenceData, SequenceSource
 from forbes.errors import ForbesError
 from forbes.models import Likelihood
+from forbes.models.world import World
 from forbes.pomdps import Process
 
+if TYPE_CHECKING:
+    from lightning.pytorch.cli import LightningArgumentParser
+
 __all__ = ["add_links", "add_seed", "allow_modules", "allowed_modules", "changed_defaults", "data_paths"]
-__all__ += ["data_parser", "experiment_parser", "require_classes"]
+__all__ += ["data_parser", "experiment_parser", "plain_parser", "require_classes"]
 
 _OF_FORBES = ("beliefs", "callbacks", "data", "models", "pomdps", "training")
 _OF_LIGHTNING = ("accelerators", "callbacks", "loggers", "plugins", "profilers", "strategies")
@@ -36,11 +32,8 @@ TRUSTED = (
 )
 """Packages whose classes a configuration may use, and the public names of `import forbes`."""
 _REFUSED = ("*",)  # everything else
-FAMILIES: tuple[type, ...] = (
-    *(nn.Module, Likelihood, LightningDataModule, SequenceSource, Process, Callback, Logger, Profiler),
-    *(Accelerator, CheckpointIO, ClusterEnvironment, LayerSync, Precision, Strategy),
-)
-"""Base classes of the classes that a configuration may use."""
+FAMILIES: tuple[type, ...] = (nn.Module, Likelihood, SequenceData, SequenceSource, Process)
+"""Base classes of the classes that a configuration may use, with those of Lightning."""
 _BY_A_CLASS = "Use a class of forbes or Lightning, or one of your own with --allow-module MODULE"
 _allowed: dict[str, None] = {}  # ordered; for the lifetime of the process, as in jsonargparse
 
@@ -76,7 +69,7 @@ def allowed_modules() -> list[str]:
 
 
 def require_classes(config: Any, key: str = "") -> None:
-    """Refuse a parsed configuration that would call anything but a class of `FAMILIES` or of an allowed module.
+    """Refuse a parsed configuration that would call anything but a class of `_families` or of an allowed module.
 
     jsonargparse checks classes against the type of a parameter. But if the parameter is a Callable, it calls any
     function with the arguments of the configuration. A function of an allowed module may be given by name only.
@@ -108,8 +101,27 @@ def _require_class(path: str, key: str) -> None:
     """Refuse a path that is not an allowed class; parsing has already imported it."""
     module, _, name = path.rpartition(".")
     kind = getattr(sys.modules.get(module), name, None)
-    if not isinstance(kind, type) or not (issubclass(kind, FAMILIES) or _is_allowed(kind.__module__)):
+    if not isinstance(kind, type) or not (issubclass(kind, _families()) or _is_allowed(kind.__module__)):
         raise ForbesError(f"{key}: {path} is not a class that fits here. {_BY_A_CLASS}")
+
+
+def _families() -> tuple[type, ...]:
+    """Return the base classes of the classes that a configuration may use.
+
+    Before Lightning is imported, no class can be derived from one of Lightning's.
+    """
+    if "lightning" not in sys.modules:
+        return FAMILIES
+    from lightning import Callback, LightningDataModule
+    from lightning.fabric.plugins import CheckpointIO, ClusterEnvironment, Precision
+    from lightning.pytorch.accelerators import Accelerator
+    from lightning.pytorch.loggers import Logger
+    from lightning.pytorch.plugins import LayerSync
+    from lightning.pytorch.profilers import Profiler
+    from lightning.pytorch.strategies import Strategy
+
+    plugins = (Accelerator, CheckpointIO, ClusterEnvironment, LayerSync, Precision, Strategy)
+    return (*FAMILIES, LightningDataModule, Callback, Logger, Profiler, *plugins)
 
 
 def _is_allowed(module: str | None) -> bool:
@@ -117,7 +129,7 @@ def _is_allowed(module: str | None) -> bool:
     return any(f"{module}.".startswith(f"{name}.") for name in _allowed)
 
 
-def add_seed(parser: LightningArgumentParser) -> None:
+def add_seed(parser: ArgumentParser) -> None:
     """Add the random seed of an experiment."""
     parser.add_argument(
         "--seed_everything",
@@ -127,7 +139,7 @@ def add_seed(parser: LightningArgumentParser) -> None:
     )
 
 
-def add_links(parser: LightningArgumentParser) -> None:
+def add_links(parser: ArgumentParser) -> None:
     """Link the data's shapes and kind of actions to the model's arguments, and the seed to both."""
     for name in ("observation_shape", "action_dim", "discrete"):
         parser.link_arguments(f"data.{name}", f"model.init_args.{name}", apply_on="instantiate")
@@ -152,8 +164,13 @@ def data_paths(data: Namespace) -> dict[str, str]:
     return {key: value for key, value in data.items() if key.split(".")[-1] == "path" and isinstance(value, str)}
 
 
-def experiment_parser() -> LightningArgumentParser:
+def experiment_parser() -> "LightningArgumentParser":
     """Return a parser for model and data, without the trainer."""
+    from lightning import LightningModule
+    from lightning.pytorch.cli import LightningArgumentParser
+
+    from forbes.data.datamodule import SequenceDataModule
+
     parser = LightningArgumentParser(exit_on_error=False)
     add_seed(parser)
     parser.add_lightning_class_args(LightningModule, "model", subclass_mode=True)
@@ -162,8 +179,25 @@ def experiment_parser() -> LightningArgumentParser:
     return parser
 
 
-def data_parser() -> LightningArgumentParser:
+def data_parser() -> "LightningArgumentParser":
     """Return a parser for the data alone."""
+    from lightning.pytorch.cli import LightningArgumentParser
+
+    from forbes.data.datamodule import SequenceDataModule
+
     parser = LightningArgumentParser(exit_on_error=False)
     parser.add_lightning_class_args(SequenceDataModule, "data", subclass_mode=True)
+    return parser
+
+
+def plain_parser() -> ArgumentParser:
+    """Return a parser for the arguments of a `WorldModel` and a `SequenceDataModule`, without Lightning."""
+    parser = ArgumentParser(exit_on_error=False)
+    add_seed(parser)
+    parser.add_class_arguments(World, "model.init_args", fail_untyped=False)
+    parser.add_class_arguments(SequenceData, "data.init_args", fail_untyped=False)
+    for name in ("observation_shape", "action_dim"):
+        parser.link_arguments(f"data.init_args.{name}", f"model.init_args.{name}", apply_on="instantiate")
+    for part in ("model", "data"):
+        parser.link_arguments("seed_everything", f"{part}.init_args.seed")
     return parser

@@ -12,8 +12,9 @@ from forbes.errors import ForbesError
 from forbes.files import replace_file, require_no_links
 from forbes.runs.checkpoint import compressed_checkpoint, open_checkpoint, read_checkpoint
 from forbes.runs.folder import RunFolder
-from forbes.runs.modules import build_run, check_weights, weights_of
+from forbes.runs.modules import build_run
 from forbes.runs.provenance import read_provenance
+from forbes.runs.worlds import check_weights, weights_of
 
 __all__ = ["EXPORTED", "export_run", "shareable"]
 

@@ -4,15 +4,16 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 import forbes
 from forbes.bundled import run_path
 from forbes.errors import ForbesError
 from forbes.files import locked, remove_halves, require_no_links
 from forbes.reading import is_number, read_yaml
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["RunFolder", "experiment_name", "read_config", "read_metrics"]
 
@@ -77,6 +78,18 @@ class RunFolder:
                 return cls(path)
 
     @classmethod
+    def existing(cls, path: Path | str) -> "RunFolder":
+        """Return a run folder that exists.
+
+        Raises:
+            ForbesError: if it does not.
+        """
+        run = cls(path)
+        if not run.path.is_dir():
+            raise ForbesError(f"{run}: no such run folder. `forbes fit` creates one in runs/")
+        return run
+
+    @classmethod
     def trained(cls, path: Path | str) -> "RunFolder":
         """Return the folder of a run that has a checkpoint.
 
@@ -84,9 +97,7 @@ class RunFolder:
             ForbesError: if the run does not exist or has no checkpoint yet, or if a folder in it is a symbolic link,
                 through which results would be written elsewhere.
         """
-        run = cls(path)
-        if not run.path.is_dir():
-            raise ForbesError(f"{run}: no such run folder. `forbes fit` creates one in runs/")
+        run = cls.existing(path)
         if not run.config.is_file():
             raise ForbesError(f"{run}: not a run folder, config.yaml is missing. Name a folder written by `forbes fit`")
         if run.results != run.path and not run.checkpoint.is_file():
@@ -152,7 +163,7 @@ def _with_public_names(section: Any) -> Any:
     return f"forbes.{name}" if module and forbes.MODULES.get(name) == module else section
 
 
-def read_metrics(run: Path | str) -> pd.DataFrame:
+def read_metrics(run: Path | str) -> "pd.DataFrame":
     """Read a run's metrics: one row per update, one column per name, with the last of several values.
 
     A run that was killed and resumed repeats the updates after its checkpoint. The lines before the kill are dropped.
@@ -160,6 +171,8 @@ def read_metrics(run: Path | str) -> pd.DataFrame:
     Raises:
         ForbesError: if the file is missing or has an invalid line.
     """
+    import pandas as pd  # it takes longer to import than a run folder to check
+
     path = RunFolder(run).metrics
     if not path.is_file():
         raise ForbesError(f"{path}: no such file. Name a run folder written by `forbes fit`")

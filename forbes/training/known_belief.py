@@ -75,7 +75,8 @@ class KnownBelief(SeededModule):
         learning_rate: float = 3e-3,
         seed: int = 0,
     ) -> None:
-        super().__init__(learning_rate, seed, schedule="cosine")
+        super().__init__()
+        self.learning_rate, self.seed, self.schedule = learning_rate, seed, "cosine"
         sizes = {"hidden_dim": hidden_dim, "mlp_dim": mlp_dim, "mlp_layers": mlp_layers}
         require_positive("KnownBelief", **sizes, learning_rate=learning_rate)
         _require_density(process, objective)

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
 from lightning import LightningModule
@@ -13,12 +13,11 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from forbes.data import SequenceBatch
 from forbes.distributed import WeightedMeans, num_ranks, rank
+from forbes.models.world import Schedule
 from forbes.seeding import derive_seed
 from forbes.training.divergence import hold_unless_finite
 
-__all__ = ["Group", "Schedule", "SeededModule"]
-
-Schedule: TypeAlias = Literal["constant", "cosine"]
+__all__ = ["Group", "SeededModule"]
 
 
 class Group(NamedTuple):
@@ -45,18 +44,18 @@ class SeededModule(LightningModule, ABC):
     - `measure`: what a validation or a test logs of a batch.
     - `objective_name`: which of these values says how well the training goes.
 
-    Args:
-        learning_rate: learning rate of Adam at its highest.
-        seed: random seed of the noise of training and validation.
-        schedule: "constant", or "cosine" to 0 at the end of the training.
-        warmup: updates over which the learning rate rises from 0.
+    Its constructor sets the learning rate of Adam at its highest, and the random seed.
     """
 
     adam_eps: ClassVar[float] = 1e-8
-
-    def __init__(self, learning_rate: float, seed: int, schedule: Schedule = "constant", warmup: int = 0) -> None:
-        super().__init__()
-        self.learning_rate, self.seed, self.schedule, self.warmup = learning_rate, seed, schedule, warmup
+    learning_rate: float
+    """Learning rate of Adam at its highest."""
+    seed: int
+    """Random seed of the noise of training and validation."""
+    schedule: Schedule = "constant"
+    """Either "constant", or "cosine" to 0 at the end of the training."""
+    warmup: int = 0
+    """Updates over which the learning rate rises from 0."""
 
     def groups(self) -> list[Group]:
         """Return which parameters share a learning rate and are clipped together."""

@@ -9,21 +9,15 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from forbes.beliefs import BeliefFamily, FlowBelief
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.distributed import means_over_ranks, shared_batch, sum_over_ranks
-from forbes.errors import require_at_least
-from forbes.models.base import ModelFamily, ModelParts
-from forbes.models.elbo import KL, ElboTerms, FreeNats, elbo_loss
-from forbes.models.likelihoods import Likelihood, Normal
-from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
-from forbes.models.state_space import StateSpaceModel
+from forbes.models.elbo import ElboTerms, elbo_loss
+from forbes.models.world import World
 from forbes.runs.hyperparameters import plain_arguments
 from forbes.runs.modules import load_module
 from forbes.signatures import full_signature
 from forbes.training.defaults import defaults_for
-from forbes.training.requirements import require_mean, require_path, require_rank
-from forbes.training.seeded import Schedule, SeededModule
+from forbes.training.seeded import SeededModule
 
 __all__ = ["LossTerm", "WorldModel", "sum_of_terms"]
 
@@ -37,7 +31,7 @@ class LossTerm(NamedTuple):
     """What is logged with it: scalars by name, without a gradient."""
 
 
-class WorldModel(SeededModule):
+class WorldModel(World, SeededModule):
     """Learns a belief state model of sequences by a bound (paper §3.1). Defaults are the paper's for DeepMind Control.
 
     Args:
@@ -81,61 +75,8 @@ class WorldModel(SeededModule):
         torch.Size([8])
     """
 
-    def __init__(
-        self,
-        belief: BeliefFamily = FlowBelief,
-        prior: BeliefFamily | None = None,
-        model: ModelFamily = StateSpaceModel,
-        encoder: EncoderFamily = ConvEncoder,
-        decoder: DecoderFamily = ConvDecoder,
-        likelihood: Likelihood | None = None,
-        observation_shape: tuple[int, ...] = (3, 64, 64),
-        action_dim: int = 0,
-        state_dim: int = 30,
-        hidden_dim: int = 200,
-        mlp_dim: int = 200,
-        mlp_layers: int = 2,
-        activation: Activation = "relu",
-        kl: KL = "analytic",
-        free_nats: float = 3.0,
-        free_nats_per: FreeNats = "batch",
-        kl_warmup: int = 0,
-        learning_rate: float = 5e-4,
-        schedule: Schedule = "constant",
-        warmup: int = 0,
-        clip_norm: float = 100.0,
-        center: bool = False,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(learning_rate, seed, schedule, warmup)
-        require_at_least(1, "WorldModel", hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers)
-        require_at_least(0, "WorldModel", state_dim=state_dim, learning_rate=learning_rate, clip_norm=clip_norm)
-        likelihood = likelihood or Normal()
-        require_rank(likelihood, observation_shape)
-        self.model = model(
-            ModelParts(
-                belief=belief,
-                prior=prior,
-                encoder=encoder(observation_shape),
-                decoder=decoder(hidden_dim + state_dim, observation_shape),
-                likelihood=likelihood,
-                action_dim=action_dim,
-                state_dim=state_dim,
-                hidden_dim=hidden_dim,
-                mlp_dim=mlp_dim,
-                mlp_layers=mlp_layers,
-            )
-        )
-        require_path(kl, self.model)
-        self.activation: Activation = activation
-        activate(self.model, activation)
-        if center:
-            require_mean(likelihood)
-            self.model.center = torch.zeros(observation_shape)
-        self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
-        self.clip_norm = clip_norm
-        self.recorded: Callable[[SequenceBatch], LossTerm] | None = None  # by `CudaGraph`, to replace `total_loss`
-
+    recorded: Callable[[SequenceBatch], LossTerm] | None = None
+    """An update that `CudaGraph` has recorded, to replace `total_loss`."""
     adam_eps = 1e-7
     __signature__: ClassVar[inspect.Signature]
 

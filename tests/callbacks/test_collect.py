@@ -16,8 +16,9 @@ from forbes.data.episodes.store import EpisodeStore
 from forbes.data.episodes.worker import EpisodeWorker
 from forbes.envs import EnvironmentProcess
 from forbes.evaluation.reward_prediction import predict_rewards, r2_score
-from forbes.runs.checkpoint import ResumeWholeEpochs, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder, read_metrics
+from forbes.runs.saving import ResumeWholeEpochs
 from forbes.seeding import derive_seed
 from forbes.training import ImaginationActorCritic
 from forbes.training.acting import play_measured

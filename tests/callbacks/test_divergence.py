@@ -15,8 +15,9 @@ from torch.optim import Adam
 from forbes.commands.cli import main
 from forbes.control.return_scale import ReturnScale
 from forbes.data import SequenceBatch
-from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder, read_config, read_metrics
+from forbes.runs.saving import AtomicCheckpointIO
 from forbes.seeding import derive_seed
 from forbes.training.divergence import hold_unless_finite
 from forbes.training.loading import load_run

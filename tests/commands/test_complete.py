@@ -5,8 +5,8 @@ import torch
 from command_line import error_of
 from matplotlib.figure import Figure
 
-from forbes.callbacks.prediction_grid import prediction_grid
 from forbes.commands.cli import main
+from forbes.figures.prediction_grid import prediction_grid
 from forbes.training.loading import load_run
 
 SMALL = ["--context", "3", "--samples", "2"]

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from forbes.beliefs import GaussianBelief
-from forbes.callbacks.picture import colour_of
+from forbes.figures.prediction_grid import colour_of
 from forbes.figures.style import METHODS, method_styles, method_title
 from forbes.training.loading import load_run
 

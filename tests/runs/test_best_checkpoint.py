@@ -8,8 +8,9 @@ import torch
 from small_agents import fit, forbes, write_config
 
 from forbes.commands.cli import main
-from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder, read_metrics
+from forbes.runs.saving import AtomicCheckpointIO
 from forbes.training import WorldModel
 
 

@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from forbes.errors import ForbesError
-from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
+from forbes.runs.saving import AtomicCheckpointIO
 
 OLD, NEW = {"weight": torch.zeros(1000)}, {"weight": torch.ones(2000)}
 
@@ -70,7 +71,7 @@ def test_a_checkpoint_linked_as_previous_leaves_no_third_name(path):
 def test_a_real_kill_leaves_a_whole_checkpoint(tmp_path):
     program = """
 import sys, itertools, pathlib, torch
-from forbes.runs.checkpoint import AtomicCheckpointIO
+from forbes.runs.saving import AtomicCheckpointIO
 for i in itertools.count():
     AtomicCheckpointIO().save_checkpoint({"weight": torch.full((50_000,), i)}, pathlib.Path(sys.argv[1]))
     print(i, flush=True)

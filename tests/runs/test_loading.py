@@ -9,8 +9,9 @@ import yaml
 
 from forbes.commands.cli import main
 from forbes.errors import ForbesError
-from forbes.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder
+from forbes.runs.saving import AtomicCheckpointIO
 from forbes.training.loading import load_run
 
 

@@ -8,9 +8,10 @@ import pytest
 from continued_runs import assert_same_run
 
 from forbes.commands.cli import main
-from forbes.runs.checkpoint import ResumeWholeEpochs, read_checkpoint
+from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.folder import RunFolder, read_metrics
 from forbes.runs.provenance import read_provenance
+from forbes.runs.saving import ResumeWholeEpochs
 from forbes.training import WorldModel
 
 FOUR_EPOCHS = ["--trainer.max_epochs", "4"]  # of five updates

@@ -3,7 +3,7 @@
 from typing import get_args
 
 from forbes.choices import Split
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import ArgumentParser, existing_run, positive
 from forbes.commands.parsers.evaluate import add_output
 
 __all__ = ["parser"]
@@ -35,7 +35,9 @@ Writes evaluation.json, and evaluation.npz with the scores of each sequence, to 
 def parser() -> ArgumentParser:
     """Return the parser of `forbes beliefs`."""
     command = ArgumentParser("forbes beliefs", _DESCRIPTION)
-    command.add_argument("runs", nargs="+", metavar="RUN", help="run folder of a KnownBelief, written by `forbes fit`")
+    command.add_argument(
+        "runs", nargs="+", metavar="RUN", type=existing_run, help="run folder of a KnownBelief, written by `forbes fit`"
+    )
     add_output(command)
     command.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
     command.add_argument("--sequences", type=positive, default=200, help="number of sequences (default: 200)")

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import get_args
 
 from forbes.choices import Split
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import ArgumentParser, existing_run, positive
 
 __all__ = ["parser"]
 
@@ -22,7 +22,9 @@ length and, if a sequence is longer, at the end of the longest. Each column of c
 def parser() -> ArgumentParser:
     """Return the parser of `forbes complete`."""
     command = ArgumentParser("forbes complete", _DESCRIPTION)
-    command.add_argument("run", metavar="RUN", help="run folder written by `forbes fit`, or a checkpoint in it")
+    command.add_argument(
+        "run", metavar="RUN", type=existing_run, help="run folder written by `forbes fit`, or a checkpoint in it"
+    )
     command.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture, .png or .pdf")
     command.add_argument("--split", choices=get_args(Split), default="test", help="default: test")
     command.add_argument(

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from forbes.bundled import PRETRAINED, pretrained_names
-from forbes.commands.arguments import ArgumentParser
+from forbes.commands.arguments import ArgumentParser, existing_run
 
 __all__ = ["parser"]
 
@@ -30,7 +30,9 @@ def parser() -> ArgumentParser:
     """Return the parser of `forbes export`."""
     names = ", ".join(f"{PRETRAINED}{name}" for name in pretrained_names()) or "none"
     command = ArgumentParser("forbes export", _DESCRIPTION.format(names=names))
-    command.add_argument("run", metavar="RUN", help="run folder written by `forbes fit`, or a checkpoint in it")
+    command.add_argument(
+        "run", metavar="RUN", type=existing_run, help="run folder written by `forbes fit`, or a checkpoint in it"
+    )
     command.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="folder to write (default: exported/NAME-OF-RUN)"
     )

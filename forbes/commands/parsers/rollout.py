@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from forbes.commands.arguments import ArgumentParser, positive
+from forbes.commands.arguments import ArgumentParser, existing_run, positive
 from forbes.commands.parsers.evaluate import add_acting_samples
 
 __all__ = ["parser"]
@@ -23,7 +23,9 @@ Writes a GIF or MP4 of all episodes, and prints the return of each episode, its 
 def parser() -> ArgumentParser:
     """Return the parser of `forbes rollout`."""
     command = ArgumentParser("forbes rollout", _DESCRIPTION)
-    command.add_argument("run", metavar="RUN", help="run folder of an agent, written by `forbes fit`")
+    command.add_argument(
+        "run", metavar="RUN", type=existing_run, help="run folder of an agent, written by `forbes fit`"
+    )
     command.add_argument("--video", type=Path, required=True, metavar="FILE", help="file to write, .gif or .mp4")
     command.add_argument("--episodes", type=positive, default=1, help="number of episodes (default: 1)")
     command.add_argument("--grid", action="store_true", help="show the episodes at the same time, in a grid")

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forbes.data import SequenceBatch, SequenceDataModule, Split, Strokes
+from forbes.data import SequenceBatch, SequenceData, Split, Strokes
 from forbes.data.strokes.classifiers import DigitClassifier, DigitClassifiers
 from forbes.errors import ForbesError
 from forbes.evaluation.digits.neighbours import TrainingPrefixes, mean_frame
@@ -75,14 +75,14 @@ class Prefixes(NamedTuple):
     reference: Tensor
     """Class probabilities given the prefix, r(y | o_1:c), float64 (B, 10)."""
 
-    def batches(self, data: SequenceDataModule, split: Split) -> Iterator[tuple[int, SequenceBatch]]:
+    def batches(self, data: SequenceData, split: Split) -> Iterator[tuple[int, SequenceBatch]]:
         """Yield the whole digits in batches, with the position of the first."""
         for rows in torch.arange(len(self.digits)).split(_ROWS):
             yield int(rows[0]), data.sequences(split, self.digits[rows], int(self.steps.max()))
 
 
 def select_prefixes(
-    data: SequenceDataModule, split: Split, digits: int, context: int, classifier: DigitClassifier
+    data: SequenceData, split: Split, digits: int, context: int, classifier: DigitClassifier
 ) -> Prefixes:
     """Return the prefixes of those of the first `digits` digits of a split that continue after `context` steps.
 
@@ -108,7 +108,7 @@ def _history(last: Tensor, mean: Tensor) -> Tensor:
     return torch.cat((last, mean), -3)
 
 
-def model_scorer(data: SequenceDataModule, context: int, samples: int, classifiers: DigitClassifiers) -> Scorer:
+def model_scorer(data: SequenceData, context: int, samples: int, classifiers: DigitClassifiers) -> Scorer:
     """Return the scorer of a model's N completions.
 
     Args:
@@ -126,7 +126,7 @@ def model_scorer(data: SequenceDataModule, context: int, samples: int, classifie
     return Scorer(_READINGS, f"c={context},N={samples}", function, _ROWS)
 
 
-def truth_scorer(data: SequenceDataModule, context: int, classifiers: DigitClassifiers) -> Scorer:
+def truth_scorer(data: SequenceData, context: int, classifiers: DigitClassifiers) -> Scorer:
     """Return the scorer of the true digits as completions, a bound for the scores of single completions."""
 
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
@@ -137,7 +137,7 @@ def truth_scorer(data: SequenceDataModule, context: int, classifiers: DigitClass
     return Scorer(_READINGS, f"c={context},N={_TRUTHS}", function, _ROWS)
 
 
-def neighbour_scorer(data: SequenceDataModule, context: int, samples: int, classifiers: DigitClassifiers) -> Scorer:
+def neighbour_scorer(data: SequenceData, context: int, samples: int, classifiers: DigitClassifiers) -> Scorer:
     """Return the scorer of the N training digits with the most similar beginnings as completions."""
     training = TrainingPrefixes(data, context, mean_frame)
 
@@ -157,7 +157,7 @@ def _to_the_end(batch: SequenceBatch) -> SequenceBatch:
     return batch.first(longest)  # (B, longest, ...)
 
 
-def _pictures(data: SequenceDataModule, batch: SequenceBatch) -> SequenceBatch:
+def _pictures(data: SequenceData, batch: SequenceBatch) -> SequenceBatch:
     """Replace observations by cumulative images."""
     return batch._replace(observation=data.source.pictures(batch.observation))
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from forbes.data import SequenceDataModule, Strokes
+from forbes.data import SequenceData, Strokes
 
 __all__ = ["TrainingPrefixes", "last_frame", "mean_frame"]
 
@@ -32,7 +32,7 @@ class TrainingPrefixes:
         look: function that reduces the frames to one image, `last_frame` or `mean_frame`.
     """
 
-    def __init__(self, data: SequenceDataModule, time: int, look: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, data: SequenceData, time: int, look: Callable[[Tensor], Tensor]) -> None:
         assert isinstance(data.source, Strokes)
         self.look = look
         self.index = torch.nonzero(data.source.steps("train") > time)[:, 0]  # (M,)
