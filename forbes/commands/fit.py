@@ -43,8 +43,9 @@ from forbes.runs.configuration import (
     data_paths,
     require_classes,
 )
+from forbes.runs.end_together import EndTogether
 from forbes.runs.folder import RunFolder, experiment_name
-from forbes.runs.launched import EndTogether, chosen_by_first, is_first, launched_devices, lost_process
+from forbes.runs.launched import chosen_by_first, is_first, launched_devices, lost_process
 from forbes.runs.loggers import ParserOfRuns, open_logger, shows
 from forbes.runs.metrics_log import JsonLinesLogger, MarkStart
 from forbes.runs.progress import progress

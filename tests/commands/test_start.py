@@ -98,5 +98,5 @@ def test_an_error_of_the_configuration_is_explained_as_ever(tmp_path, tiny_run):
     config.write_text(config.read_text().replace("learning_rate:", "lerning_rate:"))
 
     assert open_world(run) is None
-    with pytest.raises(forbes.ForbesError, match="lerning_rate.*did you mean"):
+    with pytest.raises(forbes.ForbesError, match=r"lerning_rate.*did you mean"):
         open_model(run)
