@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
+import pandas as pd
 from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
@@ -16,7 +17,7 @@ from forbes.commands.budgets import Planned, Step, figures, measures
 from forbes.commands.score_tables import Run, number, score_tables
 from forbes.commands.trainings import is_finished
 from forbes.errors import ForbesError
-from forbes.evaluation.claims import CLAIMS, Claim, Held, Verdict, decide, mean_over_seeds
+from forbes.evaluation.claims import CLAIMS, Claim, Held, Verdict, by_chance, decide, mean_over_seeds
 from forbes.evaluation.contrasts import Runs, contrast
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.theorem import POSTERIORS, PROCESSES, identity
@@ -24,8 +25,12 @@ from forbes.files import replace_file
 from forbes.reading import read_json
 from forbes.runs.folder import RunFolder, read_metrics
 from forbes.runs.provenance import commit, read_provenance
+from forbes.runs.summary import objective_of
 
-__all__ = ["PAGE", "Row", "write_report"]
+__all__ = ["PAGE", "Row", "late_gain", "write_report"]
+
+_FLAT = 0.01
+"""Late gain up to which a learning curve counts as flat."""
 
 PAGE = Path("report/index.html")
 """The page in the output folder."""
@@ -56,6 +61,8 @@ class Row(NamedTuple):
     seeds: str
     """Difference of each seed."""
     verdict: Verdict
+    rising: str
+    """Which runs were still learning, or empty."""
     origin: str
     """Hours and commits."""
     runs: Sequence[int]
@@ -105,6 +112,8 @@ def write_report(
         runs=runs,
         steps=measured,
         Held=Held,
+        by_chance=by_chance,
+        flat=_FLAT,
     )
     replace_file(folder / PAGE, page.encode())
     return rows
@@ -124,9 +133,36 @@ def _run(number: int, one: Planned, failed: Mapping[str, str]) -> Run:
         one.training.seed,
         failed.get(one.training.folder) or ("missing" if not entries else _state(status)),
         0 if metrics is None or metrics.empty else int(metrics.index.max()),
+        0.0 if metrics is None else late_gain(metrics),
         sum(entry.get("hours", 0.0) for entry in entries),
         ", ".join(dict.fromkeys(_short(entry.get("commit")) for entry in entries)),
         "\n".join(dict.fromkeys(str(entry.get("command", "")) for entry in entries)),
+    )
+
+
+def late_gain(metrics: pd.DataFrame) -> float:
+    """Return the share of the whole gain of the validation that came in the last tenth of the updates.
+
+    Args:
+        metrics: metrics of a run by update. Without two validations, or without a gain, the share is 0.
+    """
+    name = objective_of([name for name in metrics if name.startswith("val/")])
+    curve = metrics[name].dropna() if name else pd.Series(dtype=float)
+    if len(curve) < 2 or curve.iloc[0] == curve.iloc[-1]:
+        return 0.0
+    before = curve[curve.index <= 0.9 * curve.index[-1]]
+    last, first = curve.iloc[-1], curve.iloc[0]
+    return float((last - (before.iloc[-1] if len(before) else first)) / (last - first))
+
+
+def _rising(runs: Sequence[Run]) -> str:
+    """Return which runs were still learning."""
+    late = [run for run in runs if run.late > _FLAT]
+    if not late:
+        return ""
+    names = ", ".join(f"r{run.number}" for run in late)
+    return (
+        f"not flat: up to {max(run.late for run in late):.0%} of the gain of {names} came in the last tenth of updates"
     )
 
 
@@ -165,7 +201,7 @@ def _claim(
     try:
         differences = contrast(claim, folders, completions)
     except ForbesError as error:  # e.g. a run was evaluated on other sequences by hand
-        return Row(claim.says, claim.where, claim.measured, "", "", Verdict(Held.UNTESTED, str(error)), "", [], [])
+        return Row(claim.says, claim.where, claim.measured, "", "", Verdict(Held.UNTESTED, str(error)), "", "", [], [])
     used = [run for run in runs if run.family in claim.families and run.seed in differences]
     verdict = decide(differences, min((run.updates for run in used), default=0), claim.updates)
     commands = ("forbes completions",) if claim.score in ("clear", "js") else ("forbes evaluate", "forbes beliefs")
@@ -178,6 +214,7 @@ def _claim(
         claim.measured,
         *_difference(differences, claim.unit),
         verdict,
+        _rising(used),
         f"{sum(run.hours for run in used):.2f} h, commit {commits}" if used else "",
         [run.number for run in used],
         [one.number for one in steps],
@@ -197,6 +234,7 @@ def _theorem() -> Row:
         f"{min(filtering):.2f} to {max(filtering):.1f} nats",
         f"with the smoothing conditionals at most {max(abs(each.smoothing - each.gap) for each in sides):.0e}",
         Verdict(Held.YES if held else Held.NO, "no training, no sampling: the limit is 1e-8 nats"),
+        "",
         f"command: forbes theorem, commit {_short(commit())}",
         [],
         [],

@@ -21,6 +21,8 @@ class Run(NamedTuple):
     state: str
     """"done", "missing", or "ended with status 3"."""
     updates: int
+    late: float
+    """Share of its whole gain by the validation that came in the last tenth of its updates; 0 without validations."""
     hours: float
     commit: str
     command: str

@@ -11,6 +11,8 @@ where :math:`\bar e` is the mean standard error over sequences, which all seeds 
 and :math:`\bar d > t \sigma`, with the 95 % quantile t of Student's distribution with n - 1 degrees of freedom. So a
 difference of seeds that is chance is taken for the claim in at most 5 % of all cases. If only :math:`\bar d > 0`, the
 claim holds in direction only, else it does not hold. Runs with fewer updates than a claim needs do not test it.
+
+There is one such test for each claim, so some of many would hold by chance: `by_chance`.
 """
 
 import math
@@ -21,9 +23,11 @@ from typing import NamedTuple
 
 from forbes.evaluation.estimates import Estimate
 
-__all__ = ["CLAIMS", "DMC_TASKS", "LEAST_SEEDS", "Claim", "Held", "Verdict", "decide", "mean_over_seeds"]
+__all__ = ["CLAIMS", "DMC_TASKS", "LEAST_SEEDS", "Claim", "Held", "Verdict", "by_chance", "decide", "mean_over_seeds"]
 
 LEAST_SEEDS = 3
+_LEVEL = 0.05
+"""Share of claims that hold by chance."""
 _QUANTILES = (math.inf, 6.314, 2.920, 2.353, 2.132, 2.015, 1.943, 1.895, 1.860, 1.833)
 """95 % quantiles of Student's t with 0 to 9 degrees of freedom; the last also serves more, for which it is larger."""
 
@@ -105,6 +109,14 @@ def decide(differences: Mapping[int, Estimate], updates: int, needed: int) -> Ve
         return Verdict(Held.YES, f"{seeds} seeds") if mean > 0 else Verdict(Held.NO, f"{seeds} seeds say the opposite")
     within = few if seeds < LEAST_SEEDS else f"{seeds} seeds, the difference is within its error"
     return Verdict(Held.DIRECTION if mean > 0 else Held.NO, within)
+
+
+def by_chance(tests: int) -> tuple[float, float]:
+    """Return how many of so many claims would hold at most if none were true, in the mean; and the chance of any.
+
+    The chance is that of independent tests. Claims that share runs are not independent; the mean is theirs too.
+    """
+    return _LEVEL * tests, 1 - (1 - _LEVEL) ** tests
 
 
 _STROKES, _PROCESSES, _AGENTS, _IMAGES = 3000, 2000, 3000, 20_000

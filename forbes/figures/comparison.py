@@ -47,7 +47,8 @@ def draw_scores(comparison: Comparison) -> Figure:
         for axes in panels[len(metrics) :]:
             axes.remove()
         panels[0].set_yticks(range(len(families)), [method_title(name) for name in families])
-        panels[0].set_ylim(len(families) - 0.5, -0.5)
+        rows_and_label = len(families) * (4 / 3 if dotted else 1)  # the lowest quarter is for the references' label
+        panels[0].set_ylim(rows_and_label - 0.5, -0.5)
         dashed = "" if np.isnan(known) else ", dashed: the exact log p, which no bound exceeds"
         names = list(next(iter(comparison.references.values()), {}))
         below = f", dotted: models without a belief, {names[0]} to {names[-1]}" if dotted else ""

@@ -69,7 +69,9 @@ def draw_prequential(runs: Sequence[str]) -> dict[str, Figure]:
         title = rf"$\log p(o_t | o_{{1:t-1}})$ minus {families[0].name}'s"
         steps.set(title=title, xlabel="step t", ylabel="nats per step")
         _draw_totals(totals, families, name, exact)
-        draw_references(totals, {name: each["mean"] for name, each in first[name].get("references", {}).items()}, "x")
+        references = {name: each["mean"] for name, each in first[name].get("references", {}).items()}
+        if draw_references(totals, references, "x"):
+            totals.set_ylim(bottom=4 / 3 * len(families) - 0.5)  # the lowest quarter is for their label
         totals.set(title=r"$\log p(o_{1:T})$, its sum", xlabel="nats per sequence, higher is better")
         totals.locator_params("x", nbins=5)
         _draw_legend(figure, steps)

@@ -181,7 +181,7 @@ def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", 
     """Draw a dotted line at each mean on a score axis, and return whether there is one.
 
     Means that are outside the axis by more than its extent are omitted. The axis is extended to the others, and the
-    highest one is labelled.
+    highest one is labelled. Along x the label is at the right of the line, in the lowest quarter of the axes.
     """
     low, high = axes.get_ylim() if along == "y" else axes.get_xlim()
     near = {name: mean for name, mean in means.items() if 2 * low - high < mean < 2 * high - low}
@@ -199,7 +199,7 @@ def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", 
     else:
         axes.set_xlim(*limits)
         at_edge = axes.get_xaxis_transform()
-        axes.text(near[best], 0.01, best, transform=at_edge, fontsize=6, color=GREY, ha="right", rotation=90)
+        axes.text(near[best], 0.03, best, transform=at_edge, fontsize=6, color=GREY, ha="left", rotation=90)
     return True
 
 

@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from command_line import error_of
@@ -16,7 +17,7 @@ from forbes.commands import budgets, reproduce, score_tables
 from forbes.commands.budgets import Family, Size
 from forbes.commands.cli import main
 from forbes.commands.parsers.reproduce import BUDGETS, PARTS
-from forbes.commands.report import write_report
+from forbes.commands.report import late_gain, write_report
 from forbes.evaluation.claims import CLAIMS
 from forbes.evaluation.record import read_record
 from forbes.runs.configs import find_config
@@ -233,13 +234,15 @@ def test_the_paper_budget_tests_each_claim(tmp_path):
 def record_run():
     """A function that writes the folder of a finished and measured run."""
 
-    def record(folder, scores, updates=3000, sha256="a"):
+    def record(folder, scores, updates=3000, sha256="a", curve=()):
         folder = Path(folder)
         (folder / "checkpoints").mkdir(parents=True)
         (folder / "checkpoints" / "last.ckpt").touch()
         entry = {"command": "forbes fit <it>", "commit": "1234567890", "hours": 0.25, "exit_status": 0}
         (folder / "provenance.json").write_text(json.dumps([entry]))
-        (folder / "metrics.jsonl").write_text(json.dumps({"update": updates, "epoch": 0}) + "\n")
+        lines = [{"update": update, "epoch": 0, "val/elbo[S=1]": value} for update, value in curve]
+        lines.append({"update": updates, "epoch": 0})
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         name, data = "test/elbo[categorical,S=16]", {"name": "digits", "sha256": sha256}
         about = {"mean": float(scores.mean()), "standard_error": 0.1, "data": data, "seed": 0}
         (folder / "evaluation.json").write_text(json.dumps({name: about}))
@@ -273,6 +276,44 @@ def test_the_page_decides_a_claim_by_the_recorded_scores(lead, updates, verdict,
     assert "1.50 h, commit 1234567" in row  # six runs of a quarter
     assert "smoke" not in page.replace("forbes reproduce --budget", "")
     assert "forbes fit &lt;it&gt;" in page
+
+
+def test_the_page_says_which_runs_still_learn_and_what_chance_gives(record_run, tmp_path):
+    """FORBES has gained 2 of 40 nats in the last tenth of its updates, the others none."""
+    planned = budgets.trainings("strokes", "small", tmp_path)
+    random = np.random.default_rng(0)
+    for one in planned:
+        late = 2 if one.family.name == "strokes/forbes" else 0
+        curve = [(300, -80.0), (2700, -40.0 - late), (2800, -40.0 - late / 2), (3000, -40.0)]
+        record_run(one.training.folder, random.normal(-40.0, 1.0, 20), curve=curve)
+
+    rows = write_report(planned, "small", tmp_path, {}, "forbes reproduce")
+
+    (numbers,) = {row.rising for row in rows if row.rising}
+    late = [number for number, one in enumerate(planned, start=1) if one.family.name == "strokes/forbes"]
+    names = ", ".join(f"r{number}" for number in late)
+    assert numbers == f"not flat: up to 5% of the gain of {names} came in the last tenth of updates"
+    page = " ".join(page_of(tmp_path).split())
+    tested = sum(row.verdict.held != "not tested" for row in rows if row.runs)
+    assert f"{tested} claims were tested with trained models, without a correction" in page
+    assert f"at most {0.05 * tested:.2f} would be expected to hold by chance" in page
+
+
+@pytest.mark.parametrize(
+    ("curve", "share"),
+    [
+        ({10: -5.0, 90: -2.0, 100: -1.0}, 0.25),
+        ({10: 5.0, 90: 2.0, 100: 1.0}, 0.25),  # a loss
+        ({10: -5.0, 90: -1.0, 100: -1.5}, -1 / 7),
+        ({100: -5.0}, 0.0),
+        ({10: -5.0, 100: -5.0}, 0.0),
+        ({95: -5.0, 100: -4.0}, 1.0),
+    ],
+)
+def test_a_late_gain_is_a_share_of_the_whole(curve, share):
+    metrics = pd.DataFrame({"val/elbo[S=1]": curve, "train/loss": dict.fromkeys(range(101), 1.0)})
+
+    assert late_gain(metrics.sort_index()) == pytest.approx(share)
 
 
 def test_a_run_measured_on_other_digits_leaves_its_claims_untested(record_run, tmp_path):

@@ -10,7 +10,7 @@ import torch
 
 from forbes.errors import ForbesError
 from forbes.evaluation import claims
-from forbes.evaluation.claims import CLAIMS, Claim, Held, decide, mean_over_seeds
+from forbes.evaluation.claims import CLAIMS, Claim, Held, by_chance, decide, mean_over_seeds
 from forbes.evaluation.contrasts import contrast, entry_of
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.metrics import score_of
@@ -46,6 +46,20 @@ def test_chance_holds_in_at_most_one_case_of_twenty(seeds, error):
 
     assert share <= 0.05 + 4 * math.sqrt(0.05 * 0.95 / TRIALS)
     assert error or share >= 0.05 - 4 * math.sqrt(0.05 * 0.95 / TRIALS)  # exactly one if sequences add no error
+
+
+def test_several_claims_hold_by_chance_as_often_as_told():
+    """Ten claims that are not true, of three seeds each, in trials of which each is one page."""
+    generator = torch.Generator().manual_seed(1)
+    pages, tests = 2000, 10
+    drawn = torch.randn(pages, tests, 3, generator=generator, dtype=torch.float64).tolist()
+    held = torch.tensor([[decide(by_seed(row), 10, 10).held == Held.YES for row in page] for page in drawn]).double()
+
+    mean, any_of_them = by_chance(tests)
+
+    assert held.sum(1).mean() == pytest.approx(mean, abs=4 * math.sqrt(tests * 0.05 * 0.95 / pages))
+    share = held.amax(1).mean()
+    assert share == pytest.approx(any_of_them, abs=4 * math.sqrt(any_of_them * (1 - any_of_them) / pages))
 
 
 @pytest.mark.parametrize(("seeds", "least"), [(3, 0.9), (5, 0.99)])

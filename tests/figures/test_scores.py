@@ -2,10 +2,12 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import error_of
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from forbes.commands.cli import main
 from forbes.evaluation.runs import load_runs
@@ -71,6 +73,29 @@ def test_the_prequential_score_is_relative_to_the_first_family(record):
     np.testing.assert_allclose(steps.lines[1].get_ydata(), [-0.5, -1.0])
     assert [line.get_xdata()[0] for line in totals.lines[:2]] == [-4.0, -5.5]
     assert [label.get_text() for label in totals.get_yticklabels()] == ["FORBES", "RSSM"]
+
+
+@pytest.mark.parametrize("beside", [-5.5, -5.6])
+def test_the_label_of_a_reference_covers_no_marker(beside, record):
+    runs = [record(0, "forbes-0", pll=[-3.0, -1.0]), record(1, "rssm-0", pll=[-3.5, -2.0])]
+    path = Path(runs[0]) / "evaluation.json"
+    entries = json.loads(path.read_text())
+    entries["test/pll[S=2]"]["references"] = {
+        name: {"mean": mean, "standard_error": 0.1} for name, mean in {"1-gram": -6.0, "5-gram": beside}.items()
+    }
+    path.write_text(json.dumps(entries))
+
+    figure = draw_prequential(runs)["prequential"]
+
+    FigureCanvasAgg(figure).draw()
+    totals = figure.axes[1]
+    (label,) = totals.texts
+    assert label.get_text() == "5-gram"
+    markers = [line for line in totals.lines if line.get_marker() not in (None, "None", "", "|")]
+    assert len(markers) == 2
+    for line in markers:
+        (x, y) = totals.transData.transform(line.get_xydata()[0])
+        assert not label.get_window_extent().padded(line.get_markersize() / 2).contains(x, y)
 
 
 def test_scores_of_other_data_or_checkpoints_are_refused(record, capsys, tmp_path):
