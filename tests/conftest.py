@@ -11,7 +11,7 @@ from small_strokes import write_config, write_strokes
 
 from forbes.commands.cli import main
 from forbes.data.strokes.file import StrokeArrays
-from forbes.runs import configuration, modules
+from forbes.runs import configuration, modules, worlds
 from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.saving import AtomicCheckpointIO
 
@@ -74,7 +74,8 @@ def overwritten(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
         content = read_checkpoint(Path(name))
         AtomicCheckpointIO().save_checkpoint(content | {"global_step": content["global_step"] + 1}, name)
 
-    monkeypatch.setattr(modules, "check_weights", check_weights)
+    for loading in (modules, worlds):
+        monkeypatch.setattr(loading, "check_weights", check_weights)
     return read
 
 

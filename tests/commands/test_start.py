@@ -1,5 +1,6 @@
 """What a command imports before it does its work: no Trainer for an evaluation, nothing heavy for a wrong name."""
 
+import inspect
 import shutil
 import subprocess
 import sys
@@ -8,7 +9,9 @@ import pytest
 import torch
 
 import forbes
+from forbes.data import SequenceData
 from forbes.evaluation.runs import open_model
+from forbes.models.world import World
 from forbes.runs.worlds import open_world
 
 PRETRAINED = "pretrained:strokes-forbes"
@@ -100,3 +103,12 @@ def test_an_error_of_the_configuration_is_explained_as_ever(tmp_path, tiny_run):
     assert open_world(run) is None
     with pytest.raises(forbes.ForbesError, match=r"lerning_rate.*did you mean"):
         open_model(run)
+
+
+@pytest.mark.parametrize(("plain", "trained"), [(World, forbes.WorldModel), (SequenceData, forbes.SequenceDataModule)])
+def test_both_forms_have_the_same_arguments(plain, trained):
+    """Help pages of a subclass take them from the first, those of the class itself from the second."""
+    arguments, of_trained = (inspect.getdoc(kind).split("Args:")[1].split("Example:")[0] for kind in (plain, trained))
+
+    assert inspect.signature(plain) == inspect.signature(trained)
+    assert arguments.strip() == of_trained.strip()
