@@ -1,7 +1,7 @@
 """The world model as a LightningModule: it optimises and logs; the mathematics is in `forbes.models`."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -20,9 +20,10 @@ from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, Decoder
 from forbes.models.state_space import StateSpaceModel
 from forbes.runs.hyperparameters import plain_arguments
 from forbes.runs.modules import load_module
+from forbes.shapes import Shape, size_of
 from forbes.signatures import full_signature
 from forbes.training.defaults import defaults_for
-from forbes.training.requirements import require_mean, require_path, require_rank
+from forbes.training.requirements import likelihood_for, require_mean, require_path
 from forbes.training.seeded import Schedule, SeededModule
 
 __all__ = ["LossTerm", "WorldModel", "sum_of_terms"]
@@ -48,7 +49,7 @@ class WorldModel(SeededModule):
         encoder: o_t to e_t, a class of `forbes.models.networks`.
         decoder: features to the likelihood's parameters, likewise.
         likelihood: what the decoder's output means; `Normal()` by default.
-        observation_shape: shape of one observation; the command line takes it from the data.
+        observation_shape: shape of one observation, or of its parts by name; the command line takes it from the data.
         action_dim: dimensions of an action, A; the command line takes it from the data.
         state_dim: dimensions of s, D; 0 for a `VectorModel`.
         hidden_dim: dimensions of h, the GRU's state, H.
@@ -89,7 +90,7 @@ class WorldModel(SeededModule):
         encoder: EncoderFamily = ConvEncoder,
         decoder: DecoderFamily = ConvDecoder,
         likelihood: Likelihood | None = None,
-        observation_shape: tuple[int, ...] = (3, 64, 64),
+        observation_shape: Shape = (3, 64, 64),
         action_dim: int = 0,
         state_dim: int = 30,
         hidden_dim: int = 200,
@@ -110,8 +111,7 @@ class WorldModel(SeededModule):
         super().__init__(learning_rate, seed, schedule, warmup)
         require_at_least(1, "WorldModel", hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers)
         require_at_least(0, "WorldModel", state_dim=state_dim, learning_rate=learning_rate, clip_norm=clip_norm)
-        likelihood = likelihood or Normal()
-        require_rank(likelihood, observation_shape)
+        likelihood = likelihood_for(observation_shape, likelihood or Normal())
         self.model = model(
             ModelParts(
                 belief=belief,
@@ -131,7 +131,8 @@ class WorldModel(SeededModule):
         activate(self.model, activation)
         if center:
             require_mean(likelihood)
-            self.model.center = torch.zeros(observation_shape)
+            parts = isinstance(observation_shape, Mapping)
+            self.model.center = torch.zeros(size_of(observation_shape) if parts else observation_shape)
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.clip_norm = clip_norm
         self.recorded: Callable[[SequenceBatch], LossTerm] | None = None  # by `CudaGraph`, to replace `total_loss`
@@ -249,6 +250,8 @@ class WorldModel(SeededModule):
             **terms.auxiliary,
         }
         values = {self.objective_name: terms.elbo.mean()} | {name: parts[name] for name in self.model.logged_terms}
+        for name, log_prob in terms.parts.items():
+            values[f"reconstruction/{name}"] = (log_prob * terms.mask).sum(1).mean()
         return {name: value.detach() for name, value in values.items()}
 
 
