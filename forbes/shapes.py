@@ -9,7 +9,8 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias, TypeVar
 
-__all__ = ["Observed", "Shape", "is_shape", "map_parts", "plain_shape", "printed_by_shape", "shape_of", "size_of"]
+__all__ = ["NAMES", "Observed", "Shape", "is_names", "is_shape", "map_parts", "part_name", "plain_shape"]
+__all__ += ["printed_by_shape", "shape_of", "size_of"]
 
 Record = TypeVar("Record")
 
@@ -17,14 +18,24 @@ Observed: TypeAlias = Any
 """An array or a tensor, or a dict of them by the names of the parts. Models read it by `Likelihood.target` only."""
 Shape: TypeAlias = tuple[int, ...] | dict[str, tuple[int, ...]]
 """Shape of an observation: `(C, H, W)` of an image, `(O,)` of a vector, or these by the names of the parts."""
-_NAME = "[A-Za-z0-9][A-Za-z0-9_-]*"
+NAMES = "letters, digits, _ and - in the names of parts, and at least one part"
+
+
+def is_names(parts: Mapping[Any, Any]) -> bool:
+    """Return whether the names of parts are valid, so that they can be those of files and metrics."""
+    valid = (isinstance(name, str) and re.fullmatch("[A-Za-z0-9][A-Za-z0-9_-]*", name) for name in parts)
+    return len(parts) > 0 and all(valid)
+
+
+def part_name(key: str) -> str:
+    """Return a valid name of a part for a key of other software: `observation_images_top`."""
+    return re.sub("[^A-Za-z0-9_-]", "_", key).lstrip("_-") or "part"
 
 
 def is_shape(value: Any) -> bool:
     """Return whether a value, as it is or as read from JSON, is the shape of an observation."""
     if isinstance(value, Mapping):
-        names = all(isinstance(name, str) and re.fullmatch(_NAME, name) for name in value)
-        return names and len(value) > 0 and all(map(_is_shape_of_array, value.values()))
+        return is_names(value) and all(map(_is_shape_of_array, value.values()))
     return _is_shape_of_array(value)
 
 

@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch, check_source
 from forbes.distributed import num_ranks, rank
 from forbes.errors import ForbesError, require_at_least
+from forbes.shapes import Shape
 
 __all__ = ["SequenceDataModule", "datamodule_of", "require_divisible"]
 
@@ -118,8 +119,8 @@ class SequenceDataModule(LightningDataModule):
         self.validation_sequences = validation_sequences
 
     @property
-    def observation_shape(self) -> tuple[int, ...]:
-        """Shape of one observation."""
+    def observation_shape(self) -> Shape:
+        """Shape of one observation, or of its parts by name."""
         return self.source.observation_shape
 
     @property

@@ -5,8 +5,22 @@ from typing import Any
 
 from forbes.beliefs import FlowBelief
 from forbes.data import SequenceSource, Simulated, Strokes
-from forbes.models import Bernoulli, ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder, Normal, OneHot, OnePixel
-from forbes.models import PartsDecoder, PartsEncoder, PartsLikelihood, PixelDecoder, PixelEncoder, VectorNormal
+from forbes.models import (
+    Bernoulli,
+    ConvDecoder,
+    ConvEncoder,
+    MLPDecoder,
+    MLPEncoder,
+    Normal,
+    OneHot,
+    OnePixel,
+    PartsDecoder,
+    PartsEncoder,
+    PartsLikelihood,
+    PixelDecoder,
+    PixelEncoder,
+    VectorNormal,
+)
 from forbes.pomdps.hmm import FiniteProcess
 
 __all__ = ["defaults_for"]

@@ -131,8 +131,8 @@ class WorldModel(SeededModule):
         activate(self.model, activation)
         if center:
             require_mean(likelihood)
-            parts = isinstance(observation_shape, Mapping)
-            self.model.center = torch.zeros(size_of(observation_shape) if parts else observation_shape)
+            flat = isinstance(observation_shape, Mapping)
+            self.model.center = torch.zeros((size_of(observation_shape),) if flat else observation_shape)
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.clip_norm = clip_norm
         self.recorded: Callable[[SequenceBatch], LossTerm] | None = None  # by `CudaGraph`, to replace `total_loss`
