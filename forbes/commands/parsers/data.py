@@ -136,6 +136,12 @@ def _add_collect(of_data: _Parser) -> None:
     )
     play.add_argument("--part", help="in Gymnasium: entry of a Dict observation to use (default: all of them)")
     play.add_argument(
+        "--parts", nargs="+", metavar="PART", help="in Gymnasium: entries of a Dict to observe, each as a part"
+    )
+    play.add_argument(
+        "--proprio", action="store_const", const=True, help="in DeepMind Control: observe the measurements, too"
+    )
+    play.add_argument(
         "--camera", type=int, help="in DeepMind Control: index of the camera (default: 0, for quadruped 2)"
     )
     play.add_argument(
