@@ -232,10 +232,10 @@ class EvaluatedRun(DeepMindControl):
 class Robot(Environment):
     """Its camera shows where it is, its joint how fast it moves and the time: an observation of two parts."""
 
-    observation_shape = {"joint": (2,), "camera": (1, 6, 6)}
     action_dim = 1
 
     def __init__(self, steps=9):
+        self.observation_shape = {"joint": (2,), "camera": (1, 6, 6)}
         self.steps = steps
 
     def reset(self, seed):

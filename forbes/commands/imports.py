@@ -26,7 +26,7 @@ def import_(
     path: str,
     output: Path,
     format: str | None = None,
-    image: str | None = None,
+    image: Sequence[str] | None = None,
     proprio: Sequence[str] | None = None,
     action: str | None = None,
     reward: str | None = None,
@@ -40,8 +40,8 @@ def import_(
         path: file or folder of the recorded episodes, or the id of a Minari data set.
         output: folder of the new store. It appears when the import is complete; until then there is `output.partial`.
         format: name of the format. Default: the one that recognises the path.
-        image: key of the observation, if it is an image.
-        proprio: keys of the observation, if it is a vector.
+        image: keys of images of the observation.
+        proprio: keys of vectors of the observation, which are joined.
         action: key of the action.
         reward: key of the reward.
         resize: side of the images in pixels.
@@ -51,7 +51,9 @@ def import_(
     Raises:
         ForbesError: if an episode is damaged, or an option does not fit the data.
     """
-    source = Source(open_reader(Path(path), format), Path(path), image, proprio or (), action, reward, resize, fps)
+    source = Source(
+        open_reader(Path(path), format), Path(path), image or (), proprio or (), action, reward, resize, fps
+    )
     _print(source)
     if dry_run:
         return

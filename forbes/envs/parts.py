@@ -61,7 +61,7 @@ class OfPart(Environment):
         if part not in (shapes := environment.observation_shape):
             raise ForbesError(
                 f"{environment.describe()['task']}: a view names the part {part}, expected one of "
-                f"{', '.join(sorted(shapes))}. Change it"
+                f"{', '.join(sorted(map(str, shapes)))}. Change it"
             )
         self.environment, self.part = environment, Part(environment, part)
         self.view = make_view(self.part, value)

@@ -40,6 +40,10 @@ class Likelihood(ABC):
         """Return a stored observation in the units of `mean`."""
         return self.target(observation)
 
+    def images(self, values: Tensor) -> Tensor:
+        """Return means or pictures as images to draw, `(*, C, H, W)`: here, the values themselves."""
+        return values
+
     @abstractmethod
     def sample(self, output: Tensor) -> Tensor:
         """Draw an observation as `target` would give it; shape of `output`."""

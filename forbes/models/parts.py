@@ -7,17 +7,18 @@ A stored observation is a dict. `PartsLikelihood.target` makes one vector of it,
 other, flat and in the order of their names. Nothing else in a model, a bound or a score knows of parts.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from forbes.errors import ForbesError
 from forbes.models.likelihoods import Likelihood, sum_of_parts
 from forbes.models.networks import Decoder, DecoderFamily, Encoder, EncoderFamily
 from forbes.shapes import Observed, Shape, size_of
 
-__all__ = ["PartsDecoder", "PartsEncoder", "PartsLikelihood"]
+__all__ = ["PartsDecoder", "PartsEncoder", "PartsLikelihood", "side_by_side"]
 
 
 class PartsLikelihood(Likelihood):
@@ -96,6 +97,10 @@ class PartsLikelihood(Likelihood):
             f"{name}[{part.name}]": part.log_prob(outputs[name], targets[name]) for name, part in self.parts.items()
         }
 
+    def images(self, values: Tensor) -> Tensor:
+        """See `Likelihood.images`: the parts that are images, side by side; vectors are left out."""
+        return side_by_side([part for part in self.split(values).values() if part.ndim == values.ndim + 2])
+
     def split(self, values: Tensor) -> dict[str, Tensor]:
         """Return the parts of a target, an output, a mean or a picture: `(*, O)` to `(*, *O_i)` by name."""
         if not self._shapes:
@@ -165,6 +170,19 @@ class PartsDecoder(Decoder):
     def forward(self, features: Tensor) -> Tensor:
         """See `Decoder`: `(N, F)` to `(N, O)`."""
         return torch.cat([decoder(features).flatten(1) for decoder in self.decoders], -1)  # (N, O)
+
+
+def side_by_side(images: Sequence[Tensor]) -> Tensor:
+    """Join images `(*, C_i, H_i, W_i)` to one as high as the highest, `(*, C, H, sum W_i)`; below lower ones it is 0.
+
+    One channel stays one if all have one. Otherwise there are three: two channels are red and cyan, of four the last is
+    left out.
+    """
+    height = max(image.shape[-2] for image in images)
+    if any(image.shape[-3] > 1 for image in images):
+        channels = {1: [0, 0, 0], 2: [0, 1, 1]}
+        images = [image[..., channels.get(image.shape[-3], [0, 1, 2]), :, :] for image in images]
+    return torch.cat([pad(image, (0, 0, 0, height - image.shape[-2])) for image in images], -1)
 
 
 def _split(values: Tensor, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:

@@ -1,7 +1,7 @@
 """The world model as a LightningModule: it optimises and logs; the mathematics is in `forbes.models`."""
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -131,8 +131,8 @@ class WorldModel(SeededModule):
         activate(self.model, activation)
         if center:
             require_mean(likelihood)
-            flat = isinstance(observation_shape, Mapping)
-            self.model.center = torch.zeros((size_of(observation_shape),) if flat else observation_shape)
+            shape = (size_of(observation_shape),) if isinstance(observation_shape, dict) else observation_shape
+            self.model.center = torch.zeros(shape)
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.clip_norm = clip_norm
         self.recorded: Callable[[SequenceBatch], LossTerm] | None = None  # by `CudaGraph`, to replace `total_loss`

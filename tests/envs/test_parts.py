@@ -56,9 +56,9 @@ def test_a_part_that_is_wrong_is_named(joint, sentence):
     camera = np.zeros((1, 6, 6), np.uint8)
 
     with pytest.raises(ValueError, match=sentence):
-        check_step(Step({"camera": camera, "joint": joint}), shape_of(Robot.observation_shape))
+        check_step(Step({"camera": camera, "joint": joint}), shape_of(Robot().observation_shape))
     with pytest.raises(ValueError, match="the observation has no parts"):
-        check_step(Step(camera), shape_of(Robot.observation_shape))
+        check_step(Step(camera), shape_of(Robot().observation_shape))
 
 
 @pytest.mark.parametrize("shape", [{}, {"a b": (3,)}, {"camera": (6, 6)}, {"camera": ()}, {3: (3,)}], ids=str)

@@ -203,8 +203,9 @@ def _add_imports(of_data: _Parser) -> None:
         "-o", "--output", type=Path, required=True, metavar="DIR", help=f"{_STORED}, which must not exist"
     )
     take.add_argument("--format", choices=FORMATS, help="format of FROM (default: the one that recognises it)")
-    take.add_argument("--image", metavar="KEY", help="key of the observation, if it is an image")
-    take.add_argument("--proprio", metavar="KEY", nargs="+", help="keys of the observation, if it is a vector; joined")
+    several = "; images and vectors, or several images, become parts of the observation"
+    take.add_argument("--image", metavar="KEY", nargs="+", help=f"keys of images of the observation{several}")
+    take.add_argument("--proprio", metavar="KEY", nargs="+", help="keys of vectors of the observation, joined to one")
     take.add_argument("--action", metavar="KEY", help="key of the action (default: by the format's usual name)")
     take.add_argument("--reward", metavar="KEY", help="key of the reward (default: by the usual name, else all are 0)")
     take.add_argument("--resize", type=positive, metavar="PIXELS", help="side of the images (default: as they are)")

@@ -1,4 +1,4 @@
-"""Episodes whose observations have several parts: each part is stored, verified and sampled like an array of its own."""
+"""Episodes whose observations have several parts: each is stored, verified and sampled like an array of its own."""
 
 import hashlib
 import json
@@ -162,6 +162,6 @@ def test_a_batch_without_a_part_is_refused(store):
 
     with pytest.raises(ForbesError, match="decode returns observation joint, expected observation camera, observation"):
         check_batch(source, batch._replace(observation={"joint": batch.observation["joint"]}))
+    double = batch.observation | {"joint": batch.observation["joint"].double()}
     with pytest.raises(ForbesError, match="decode returns observation joint float64"):
-        double = batch.observation | {"joint": batch.observation["joint"].double()}
         check_batch(source, SequenceBatch(double, *batch[1:]))
