@@ -16,7 +16,8 @@ _PUBLIC = {
     "errors": "ForbesError",
     "evaluation": "CalibrationError ELBO PLL complete evaluate filter imagine",
     "models": "Bernoulli ConvDecoder ConvEncoder MLPDecoder MLPEncoder ModelAdapter ModelParts Normal OneHot "
-    "OnePixel ParticleModel PixelDecoder PixelEncoder State StateSpaceModel SymlogNormal VectorModel VectorNormal",
+    "OnePixel ParticleModel PartsDecoder PartsEncoder PartsLikelihood PixelDecoder PixelEncoder State StateSpaceModel "
+    "SymlogNormal VectorModel VectorNormal",
     "pomdps": "LightDark LinearGaussian MirrorSensor MountainHike TMaze Tiger Ungm",
     "training": "ImaginationActorCritic KnownBelief PlanningAgent WorldModel",
     "training.loading": "load_run",

@@ -27,7 +27,7 @@ def test_so_are_the_other_records_that_a_user_meets():
     assert repr(Rollout(zeros, zeros, zeros[0])).count("float64") == 3
     assert repr(Trajectories(zeros, zeros, zeros)).startswith("Trajectories(state=float64 (2, 3), ")
     assert repr(ElboTerms(zeros, zeros, None, zeros.bool())).endswith(
-        "analytic_kl=None, mask=bool (2, 3), auxiliary={})"
+        "analytic_kl=None, mask=bool (2, 3), auxiliary={}, parts={})"
     )
     assert repr(Step(step, 1.5)) == (
         "Step(observation=uint8 (3, 8, 8), reward=1.5, terminated=False, truncated=False, frames=1)"

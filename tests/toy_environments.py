@@ -227,3 +227,33 @@ class EvaluatedRun(DeepMindControl):
     def describe(self):
         buffer = self._environment.physics.model.vis.global_
         return {"task": self.task, "buffer": [buffer.offwidth, buffer.offheight]}
+
+
+class Robot(Environment):
+    """Its camera shows where it is, its joint how fast it moves and the time: an observation of two parts."""
+
+    action_dim = 1
+
+    def __init__(self, steps=9):
+        self.observation_shape = {"joint": (2,), "camera": (1, 6, 6)}
+        self.steps = steps
+
+    def reset(self, seed):
+        self.time, self.place, self.speed = 0, float(seed % 6), 0.0
+        return Step(self.seen())
+
+    def step(self, action):
+        self.time, self.speed = self.time + 1, float(action[0])
+        self.place = float(np.clip(self.place + 2 * self.speed, 0, 5))
+        return Step(self.seen(), self.place / 5, truncated=self.time == self.steps)
+
+    def seen(self):
+        camera = np.zeros((1, 6, 6), np.uint8)
+        camera[0, 2:4, round(self.place)] = 255
+        return {"camera": camera, "joint": np.array([self.speed, self.time / 10], np.float32)}
+
+    def named_parts(self):
+        return {"velocities": [0], "clock": [1]}
+
+    def describe(self):
+        return {"task": "Robot", "steps": self.steps}

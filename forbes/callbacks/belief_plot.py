@@ -15,7 +15,7 @@ from matplotlib.transforms import blended_transform_factory
 from torch import Tensor
 
 from forbes.beliefs import BeliefHead
-from forbes.callbacks.picture import PictureCallback, require_state
+from forbes.callbacks.picture import PictureCallback, require_one_array, require_state
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import first_of_each_class
@@ -54,7 +54,8 @@ class BeliefPlot(PictureCallback):
         self.digits, self.columns, self.samples = digits, columns, samples
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse a model without a state when the training starts."""
+        """Refuse a model without a state, and observations of several parts, when the training starts."""
+        require_one_array(self, trainer)
         require_state(self, pl_module)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:

@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
 from forbes.performance.fusion import fusing
+from forbes.shapes import map_parts
 from forbes.training.world_model import LossTerm, WorldModel, sum_of_terms
 
 __all__ = ["CudaGraph", "Recording"]
@@ -84,7 +85,7 @@ class Recording:
     ) -> None:
         self.module, self.precision = module, precision
         self.parameters = [parameter for parameter in module.parameters() if parameter.requires_grad]
-        self.batch = SequenceBatch(*(values.clone() for values in batch))
+        self.batch = batch.each(torch.clone)
         self.graph = torch.cuda.CUDAGraph()
         buffers = [buffer.clone() for buffer in module.buffers()]
         try:
@@ -104,7 +105,7 @@ class Recording:
     def __call__(self, batch: SequenceBatch) -> LossTerm:
         """See `WorldModel.total_loss`."""
         for ours, theirs in zip(self.batch, batch, strict=True):
-            ours.copy_(theirs)
+            map_parts(Tensor.copy_, ours, theirs)
         self.graph.replay()
         loss: Tensor = _Replayed.apply(self.loss, self.gradients, *self.parameters)  # type: ignore[no-untyped-call]
         return LossTerm(loss, {name: value.clone() for name, value in self.logs.items()})

@@ -8,6 +8,7 @@ from lightning import LightningModule, Trainer
 from forbes.callbacks.collect import Collect, require_agent
 from forbes.callbacks.picture import FileCallback, require_frames
 from forbes.data import SequenceDataModule
+from forbes.figures.episodes import frames_of
 from forbes.figures.video import gif
 from forbes.files import replace_file
 from forbes.training.acting import WorldModelAgent
@@ -41,4 +42,4 @@ class EpisodeVideo(FileCallback):
         callbacks = trainer.callbacks  # type: ignore[attr-defined]  # untyped in Lightning
         collect = next(callback for callback in callbacks if isinstance(callback, Collect))
         episode = collect.evaluation_episode(trainer, cast(WorldModelAgent, module), 0)
-        replace_file(path, gif([episode.observation]))
+        replace_file(path, gif([frames_of(episode.observation)]))

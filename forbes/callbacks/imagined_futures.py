@@ -18,7 +18,8 @@ class ImaginedFutures(PictureCallback):
     """Draws `figures/futures.png`: a true sequence, and below it N imagined futures for the same actions.
 
     The futures start from N samples of the belief over (h, s) after `context` frames, each on its own trajectory. Where
-    they differ, the belief is uncertain. The sequence is the first of `shown_sequences`.
+    they differ, the belief is uncertain. The sequence is the first of `shown_sequences`. Of observations of several
+    parts, the images are drawn side by side, and vectors are left out.
 
     Args:
         samples: number of futures, N.
@@ -47,7 +48,8 @@ class ImaginedFutures(PictureCallback):
         batch = shown_sequences(data, 1, module)
         last = max(self.context + 1, int(batch.mask.sum()))
         batch = batch.first(last)  # (1, last, ...)
-        truth = data.source.pictures(module.model.likelihood.picture(batch.observation))[0]  # (last, C, H, W)
+        likelihood = module.model.likelihood
+        truth = data.source.pictures(likelihood.images(likelihood.picture(batch.observation)))[0]  # (last, C, H, W)
         completions = complete(module.model, data.source, batch, self.context, self.samples)
         futures = completions.frames[:, 0]  # (N, last - context, C, H, W)
         return imagination.draw_futures(truth, futures, self.context, self.columns, colour_of(module.model))

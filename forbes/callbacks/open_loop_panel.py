@@ -24,7 +24,8 @@ class OpenLoopPanel(PictureCallback):
     """Draws `figures/open_loop.png`: truth, model and error of some sequences, one column per step.
 
     The model sees and reconstructs the first frames. From its belief after them it imagines the others for the recorded
-    actions, one trajectory per sequence. The sequences are those of `shown_sequences`.
+    actions, one trajectory per sequence. The sequences are those of `shown_sequences`. Of observations of several
+    parts, the images are drawn side by side, and vectors are left out.
 
     Args:
         sequences: number of sequences.
@@ -56,6 +57,7 @@ class OpenLoopPanel(PictureCallback):
         model = module.model
         assert isinstance(model, StateSpaceModel)
         batch = shown_sequences(data, self.sequences, module)
-        truth = data.source.pictures(model.likelihood.picture(batch.observation))  # (B, T, C, H, W)
+        likelihood = model.likelihood
+        truth = data.source.pictures(likelihood.images(likelihood.picture(batch.observation)))  # (B, T, C, H, W)
         expected = data.source.pictures(open_loop_frames(model, batch, self.context))
         return imagination.draw_open_loop(truth, expected, batch.mask, self.context, self.columns)

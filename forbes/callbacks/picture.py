@@ -26,6 +26,7 @@ __all__ = [
     "PictureCallback",
     "require_context",
     "require_frames",
+    "require_one_array",
     "require_state",
     "shown_sequences",
 ]
@@ -128,7 +129,16 @@ def require_state(callback: Callback, module: LightningModule) -> None:
         )
 
 
+def require_one_array(callback: Callback, trainer: Trainer) -> None:
+    """Raise a ForbesError if observations have several parts."""
+    if isinstance(shape := datamodule_of(trainer).observation_shape, dict):
+        raise ForbesError(
+            f"{type(callback).__name__}: the observations have the parts {', '.join(shape)}, expected one array. "
+            "Remove this callback"
+        )
+
+
 def require_frames(callback: Callback, trainer: Trainer) -> None:
-    """Raise a ForbesError unless the observations are images."""
+    """Raise a ForbesError unless the observations are images, or have some among their parts."""
     shape = datamodule_of(trainer).observation_shape
     require_images(type(callback).__name__, shape, "Remove this callback, or observe pixels")

@@ -3,7 +3,7 @@
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.callbacks.picture import PictureCallback, require_context, require_frames
+from forbes.callbacks.picture import PictureCallback, require_context, require_frames, require_one_array
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import first_of_each_class, whole_sequences
@@ -36,6 +36,7 @@ class PredictionGrid(PictureCallback):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Refuse data that cannot be drawn when the training starts."""
+        require_one_array(self, trainer)
         require_frames(self, trainer)
         require_context(self, trainer, self.context)
 

@@ -11,7 +11,7 @@ from forbes.data import SequenceData
 from forbes.errors import ForbesError
 from forbes.evaluation.predictions import first_of_each_class, whole_sequences
 from forbes.evaluation.runs import open_model
-from forbes.figures.grids import require_images
+from forbes.figures.grids import require_only_images
 from forbes.figures.prediction_grid import prediction_grid
 from forbes.figures.style import save_figure
 from forbes.seeding import forked
@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> None:
 
 def _index(args: Any, data: SequenceData) -> Tensor:
     """Return the sequences to draw, `(B,)`, int64; refuse data that cannot be drawn."""
-    require_images(args.run, data.observation_shape, "Name a run on images")
+    require_only_images(args.run, data.observation_shape, "Name a run on images")
     if args.context >= data.length:
         raise ForbesError(f"--context {args.context}: expected less than the length of the sequences, {data.length}")
     size = data.source.size(args.split)

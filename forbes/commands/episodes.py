@@ -9,8 +9,10 @@ import numpy as np
 from forbes.data.episodes.episode import EpisodeRecord
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.factors import as_discrete, factor_sizes
-from forbes.figures.episodes import MAX_CHANNELS, draw_strips
+from forbes.figures.episodes import draw_strips
+from forbes.figures.grids import is_image
 from forbes.figures.style import save_figure
+from forbes.shapes import shape_of
 
 __all__ = ["check", "count_steps", "info"]
 
@@ -28,8 +30,7 @@ def info(path: Path, output: Path | None = None) -> None:
     records = sorted(store.records.values(), key=lambda record: record.total_reward)
     for name, value in _facts(store, records):
         print(f"{name:<22}{value}")
-    shape = records[0].environment["observation_shape"]
-    if len(shape) == 3 and shape[0] <= MAX_CHANNELS:
+    if is_image(shape_of(records[0].environment["observation_shape"])):
         chosen = {record.number: record for record in (records[0], records[len(records) // 2], records[-1])}
         rows = [(f"episode {n}\nreturn {one.total_reward:.1f}", store.episode(n)) for n, one in chosen.items()]
         picture = output or path / "frames.png"

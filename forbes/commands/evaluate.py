@@ -155,7 +155,8 @@ def _add_references(evaluated: EvaluatedRun, jobs: Sequence[_Job], split: Split)
 def _image_entries(run: TrainedRun, jobs: Sequence[_Job], number: int, args: Any) -> dict[str, dict[str, Any]]:
     """Return the entries of PSNR and SSIM of run `number`, by metric; {} without images or an open-loop score."""
     job = next((job for job in jobs if job.name == "open-loop"), None)
-    if job is None or len(run.data.observation_shape) != 3:
+    shape = run.data.observation_shape
+    if job is None or not isinstance(shape, tuple) or len(shape) != 3:
         return {}
     began, futures = time.monotonic(), futures_of(run.model, args.futures)
     batches = split_batches(run.data, args.split, job.sequences, image_rows(run.data.length - args.context))

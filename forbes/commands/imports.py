@@ -26,7 +26,7 @@ def import_(
     path: str,
     output: Path,
     format: str | None = None,
-    image: str | None = None,
+    image: Sequence[str] | None = None,
     proprio: Sequence[str] | None = None,
     action: str | None = None,
     action_sizes: Sequence[int] | None = None,
@@ -41,8 +41,8 @@ def import_(
         path: file or folder of the recorded episodes, or the id of a Minari data set.
         output: folder of the new store. It appears when the import is complete; until then there is `output.partial`.
         format: name of the format. Default: the one that recognises the path.
-        image: key of the observation, if it is an image.
-        proprio: keys of the observation, if it is a vector.
+        image: keys of images of the observation.
+        proprio: keys of vectors of the observation, which are joined.
         action: key of the action.
         action_sizes: number of options of each choice in a discrete action.
         reward: key of the reward.
@@ -53,7 +53,7 @@ def import_(
     Raises:
         ForbesError: if an episode is damaged, or an option does not fit the data.
     """
-    recorded, keys = open_reader(Path(path), format), (image, proprio or (), action, reward)
+    recorded, keys = open_reader(Path(path), format), (image or (), proprio or (), action, reward)
     source = Source(recorded, Path(path), *keys, resize, fps, action_sizes or ())
     _print(source)
     if dry_run:

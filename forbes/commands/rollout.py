@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from forbes.commands.parsers.rollout import parser
 from forbes.data.episodes.episode import Episode
@@ -17,6 +18,8 @@ from forbes.figures.dreams import curves, dream
 from forbes.figures.grids import is_image, require_images
 from forbes.figures.video import FORMATS, captioned, enlarged, side_by_side, tiled
 from forbes.files import replace_file
+from forbes.models import Likelihood, PartsLikelihood
+from forbes.shapes import map_parts
 from forbes.training.acting import WorldModelAgent
 from forbes.training.loading import loaded_agent
 
@@ -53,7 +56,7 @@ def _pictures(
 ) -> NDArray[np.uint8] | None:
     """Return the observed images of an episode, or those of a camera, `(T + 1, C, H, W)`; None if there is none."""
     if is_image(environment.observation_shape):
-        return _to_bytes(agent.model.likelihood.picture(torch.from_numpy(episode.observation)))
+        return _to_bytes(agent.model.likelihood.images(_seen(agent, episode)))
     if (make := camera_of(environment.make)) is None:
         return None
     with EnvironmentProcess(make, time_limit=len(episode.action) - 1) as camera:
@@ -63,18 +66,32 @@ def _pictures(
 def _beside(
     agent: WorldModelAgent, episode: Episode, shown: NDArray[np.uint8] | None, horizon: int, seed: int
 ) -> NDArray[np.uint8]:
-    """Show an episode, and beside it what the agent imagined: images, or the numbers of vectors as curves."""
-    imagined = dream(agent.model, episode, horizon, seed)
+    """Show an episode, and beside it what the agent imagined: images, and the numbers of vectors as curves."""
+    likelihood, imagined = agent.model.likelihood, dream(agent.model, episode, horizon, seed)
     caption = f"imagined, up to {horizon} steps ahead"
-    if episode.observation.ndim == 4:
-        dreamt = captioned(enlarged(_to_bytes(imagined)), caption)
-    else:
-        vectors = imagined.float().cpu().numpy()
+    columns = [] if shown is None else [captioned(enlarged(shown), "what happened")]
+    seen_numbers, numbers = (_vectors(likelihood, values.cpu()) for values in (_seen(agent, episode), imagined))
+    parts = likelihood.parts.values() if isinstance(likelihood, PartsLikelihood) else [likelihood]
+    if any(part.rank == 3 for part in parts):
+        columns.append(captioned(enlarged(_to_bytes(likelihood.images(imagined))), caption))
+    if seen_numbers is not None and numbers is not None:
         height = 256 if shown is None else enlarged(shown).shape[2]
-        dreamt = captioned(
-            curves(episode.observation, vectors, horizon, height), f"observed (black), {caption} (orange)"
-        )
-    return side_by_side([*([] if shown is None else [captioned(enlarged(shown), "what happened")]), dreamt])
+        drawn = curves(seen_numbers.numpy(), numbers.float().numpy(), horizon, height)
+        columns.append(captioned(drawn, f"observed (black), {caption} (orange)"))
+    return side_by_side(columns)
+
+
+def _seen(agent: WorldModelAgent, episode: Episode) -> Tensor:
+    """Return the observations of an episode in the units of pictures, `(T + 1, *O)`."""
+    observation = map_parts(lambda array: torch.from_numpy(array.copy()), episode.observation)
+    return agent.model.likelihood.picture(observation)
+
+
+def _vectors(likelihood: Likelihood, values: Tensor) -> Tensor | None:
+    """Return the numbers of vectors, of several parts those of all, `(T, O)`; None where there are only images."""
+    parts = [*likelihood.split(values).values()] if isinstance(likelihood, PartsLikelihood) else [values]
+    vectors = [part for part in parts if part.ndim == 2]
+    return torch.cat(vectors, -1) if vectors else None
 
 
 def _to_bytes(frames: torch.Tensor) -> NDArray[np.uint8]:

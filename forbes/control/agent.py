@@ -1,7 +1,7 @@
 """An agent in an episode: it filters its observations, and acts on its belief."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from forbes.control.policy import Actor, Policy
 from forbes.factors import Discrete, factor_sizes
 from forbes.models import Filtered, State, StateSpaceModel
 from forbes.seeding import derive_seed
+from forbes.shapes import Observed, map_parts
 
 __all__ = ["ActionSelector", "Agent", "explore", "follow_plan", "greedy", "noisy"]
 
@@ -42,12 +43,12 @@ class Agent:
         self.action = self.belief.state.new_zeros(1, model.action_dim)
 
     @torch.no_grad()
-    def __call__(self, observation: NDArray[Any]) -> NDArray[np.float32]:
+    def __call__(self, observation: Observed) -> NDArray[np.float32]:
         """Act on o_t, in its stored form: `(*O)` to `(A,)`."""
         device = self.action.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(derive_seed(self.seed, "act", self.steps))
-            shown = torch.from_numpy(observation).to(device)[None, None]  # (1, 1, *O)
+            shown = map_parts(lambda array: torch.from_numpy(array).to(device)[None, None], observation)  # (1, 1, *O)
             embedding = self.model.embed(shown).expand(self.samples, -1, -1)  # (K, 1, E)
             taken = self.action[:, None].expand(self.samples, -1, -1)  # (K, 1, A)
             filtered = self.model.filter(embedding, taken, self.belief)

@@ -18,9 +18,12 @@ from forbes.envs.images import CHANNELS
 from forbes.errors import ForbesError
 from forbes.factors import as_discrete, factor_sizes, to_index
 from forbes.files import writing
+from forbes.shapes import shape_of
 
 __all__ = ["export_store"]
 
+_RESERVED = ("action", "reward", "discount", "is_first", "is_last", "is_terminal")
+"""Keys of Dreamer's files that cannot be names of parts."""
 _Add: TypeAlias = Callable[[int, Episode], None]
 """Function that writes an episode, given its number in the export."""
 
@@ -38,9 +41,12 @@ def export_store(store: EpisodeStore, output: Path, name: str) -> Iterator[int]:
     """
     if output.exists():
         raise ForbesError(f"{output}: exists. Choose another name, or delete it")
-    shape = next(iter(store.records.values())).environment["observation_shape"]
-    if len(shape) == 3 and shape[0] not in CHANNELS:
-        raise ForbesError(f"{store.path}: its images have {shape[0]} channels, expected 1, 3 or 4 to export them")
+    shapes = shape_of(_environment(store)["observation_shape"])
+    for part, shape in (shapes if isinstance(shapes, dict) else {"": shapes}).items():
+        if len(shape) == 3 and shape[0] not in CHANNELS:
+            raise ForbesError(f"{store.path}: its images have {shape[0]} channels, expected 1, 3 or 4 to export them")
+        if part in _RESERVED:
+            raise ForbesError(f"{store.path}: has a part called {part}, which is another key of these formats")
     partial = output.with_name(f"{output.name}.partial")
     partial.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
@@ -60,8 +66,7 @@ def _npz(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
     def add(number: int, episode: Episode) -> None:
         last = np.arange(len(episode.reward)) == len(episode.reward) - 1  # (T + 1,)
         ends = {"is_first": last[::-1], "is_last": last, "is_terminal": last & episode.terminated}
-        key, observation = _observation(episode)
-        arrays = {key: observation, "action": episode.action, "reward": episode.reward, **ends}
+        arrays = {**_observations(episode), "action": episode.action, "reward": episode.reward, **ends}
         discount = (~ends["is_terminal"]).astype(np.float32)
         np.savez_compressed(path / f"{number:06d}-{len(episode.reward)}.npz", discount=discount, **arrays)
 
@@ -77,12 +82,13 @@ def _hdf5(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
         data.attrs["env_args"] = json.dumps({"env_name": _environment(store)["task"], "type": 2, "env_kwargs": {}})
 
         def add(number: int, episode: Episode) -> None:
-            key, observation = _observation(episode)
             demo = data.create_group(f"demo_{number}")
             demo.attrs["num_samples"] = len(episode.reward) - 1
             dones = np.zeros(len(episode.reward) - 1, np.uint8)
             dones[-1] = episode.terminated
-            arrays = {f"obs/{key}": observation[:-1], f"next_obs/{key}": observation[1:], "dones": dones}
+            arrays: dict[str, Any] = {"dones": dones}
+            for key, values in _observations(episode).items():
+                arrays |= {f"obs/{key}": values[:-1], f"next_obs/{key}": values[1:]}
             arrays |= {"actions": episode.action[1:], "rewards": episode.reward[1:]}
             for name, array in arrays.items():
                 demo.create_dataset(name, data=array, compression="gzip")
@@ -96,13 +102,14 @@ def _minari(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
     minari, spaces = imported("minari", "minari"), imported("gymnasium", "minari").spaces
     storage = imported("minari.dataset.minari_storage", "minari").MinariStorage
     buffer = imported("minari.data_collector.episode_buffer", "minari").EpisodeBuffer
-    about, (_, first) = _environment(store), _observation(store.episode(next(iter(store.records))))
-    limits = (0, 255) if first.dtype == np.uint8 else (-np.inf, np.inf)
+    about, first = _environment(store), _observations(store.episode(next(iter(store.records))))
     sizes = factor_sizes(as_discrete(about["discrete"]), about["action_dim"])
     actions = _space_of_actions(store, sizes, spaces)
     folder = (path / "data").absolute()  # the library adds a relative path to itself
     folder.mkdir(parents=True)
-    observations = spaces.Box(*limits, first.shape[1:], first.dtype)
+    boxes = {key: _box_of(values, spaces) for key, values in first.items()}
+    several = isinstance(about["observation_shape"], dict)
+    observations = spaces.Dict(boxes) if several else next(iter(boxes.values()))
     data = storage.new(folder, observations, actions, data_format="hdf5", jpeg_encoding=False)
     data_id = f"{re.sub(r'[^-_a-zA-Z0-9]', '_', name)}-v0"
     data.update_metadata({"dataset_id": data_id, "minari_version": minari.__version__})
@@ -113,7 +120,8 @@ def _minari(store: EpisodeStore, path: Path, name: str) -> Iterator[_Add]:
             action = to_index(action, sizes).reshape(-1, *actions.shape)  # (T,) or (T, F)
         last = np.arange(len(action)) == len(action) - 1  # (T,)
         ends = {"terminations": last & episode.terminated, "truncations": last & (not episode.terminated)}
-        observation = _observation(episode)[1]
+        seen = _observations(episode)
+        observation = seen if several else next(iter(seen.values()))
         data.update_episodes([buffer(number, None, None, observation, action, episode.reward[1:], **ends)])
 
     yield add
@@ -135,8 +143,18 @@ def _space_of_actions(store: EpisodeStore, sizes: tuple[int, ...], spaces: Any) 
     return spaces.Box(-bound, bound, (_environment(store)["action_dim"],), np.float32)
 
 
-def _observation(episode: Episode) -> tuple[str, NDArray[Any]]:
-    """Return the usual key of the observations, and their array: images with the channel last."""
-    if episode.observation.ndim == 4:
-        return "image", episode.observation.transpose(0, 2, 3, 1)  # (T + 1, H, W, C)
-    return "vector", episode.observation
+def _box_of(values: NDArray[Any], spaces: Any) -> Any:
+    """Return the space of images or vectors."""
+    limits = (0, 255) if values.dtype == np.uint8 else (-np.inf, np.inf)
+    return spaces.Box(*limits, values.shape[1:], values.dtype)
+
+
+def _observations(episode: Episode) -> dict[str, NDArray[Any]]:
+    """Return the observations by their usual key, or by part, images with the channel last."""
+    parts = episode.observation
+    if not isinstance(parts, dict):
+        parts = {"image" if parts.ndim == 4 else "vector": parts}
+    return {
+        name: values.transpose(0, 2, 3, 1) if values.ndim == 4 else values  # (T + 1, H, W, C)
+        for name, values in parts.items()
+    }

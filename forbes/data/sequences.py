@@ -7,6 +7,7 @@ from torch import Tensor
 from forbes.data.source import SequenceBatch, SequenceSource, Split, check_batch, check_source
 from forbes.errors import require_at_least
 from forbes.factors import Discrete
+from forbes.shapes import Shape
 
 __all__ = ["SequenceData"]
 
@@ -46,8 +47,8 @@ class SequenceData:
         self.validation_sequences = validation_sequences
 
     @property
-    def observation_shape(self) -> tuple[int, ...]:
-        """Shape of one observation."""
+    def observation_shape(self) -> Shape:
+        """Shape of one observation, or of its parts by name."""
         return self.source.observation_shape
 
     @property

@@ -1,6 +1,7 @@
 """The interface of data sources: sequences of observations, addressed by split and index."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from inspect import getattr_static
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ from forbes.errors import ForbesError
 from forbes.factors import Discrete
 from forbes.named import Named
 from forbes.seeding import generator
-from forbes.shapes import printed_by_shape
+from forbes.shapes import Observed, Shape, map_parts, printed_by_shape
 
 __all__ = ["SequenceBatch", "SequenceSource", "Split", "check_batch", "check_source"]
 
@@ -31,8 +32,8 @@ class SequenceBatch(NamedTuple):
         tensor([29, 30, 19, 30, 30, 17, 30, 29])
     """
 
-    observation: Tensor
-    """o_t, uint8 (B, T, C, H, W) for images, float32 (B, T, O) for vectors."""
+    observation: Observed
+    """o_t, uint8 (B, T, C, H, W) for images, float32 (B, T, O) for vectors; of several parts a dict of them by name."""
     action: Tensor
     """a_{t-1}, float32 (B, T, A); A may be 0."""
     reward: Tensor
@@ -46,15 +47,23 @@ class SequenceBatch(NamedTuple):
 
     def to(self, device: torch.device | str) -> "SequenceBatch":
         """Move the batch to a device."""
-        return SequenceBatch(*(values.to(device) for values in self))
+        return self.each(lambda values: values.to(device))
 
     def first(self, steps: int) -> "SequenceBatch":
         """Return the first steps of all sequences, `(B, steps, ...)`."""
-        return SequenceBatch(*(values[:, :steps] for values in self))
+        return self.each(lambda values: values[:, :steps])
+
+    def after(self, steps: int) -> "SequenceBatch":
+        """Return the steps after the first ones of all sequences, `(B, T - steps, ...)`."""
+        return self.each(lambda values: values[:, steps:])
 
     def rows(self, rows: slice) -> "SequenceBatch":
         """Return some of the sequences."""
-        return SequenceBatch(*(values[rows] for values in self))
+        return self.each(lambda values: values[rows])
+
+    def each(self, function: Callable[[Tensor], Tensor]) -> "SequenceBatch":
+        """Return the batch with a function applied to every tensor, also to those of the observation's parts."""
+        return SequenceBatch(*(map_parts(function, values) for values in self))
 
 
 class SequenceSource(Named, ABC):
@@ -64,8 +73,8 @@ class SequenceSource(Named, ABC):
     turns them into a `SequenceBatch` on the device to which they were moved.
     """
 
-    observation_shape: tuple[int, ...]
-    """Shape of one observation, without batch and time."""
+    observation_shape: Shape
+    """Shape of one observation, without batch and time, or of its parts by name."""
     action_dim: int
     """Dimension of an action, A; 0 for a process without actions."""
     discrete: Discrete = False
@@ -139,25 +148,41 @@ def check_source(source: SequenceSource) -> None:
 
 def check_batch(source: SequenceSource, batch: SequenceBatch) -> None:
     """Raise a ForbesError unless a batch is a `SequenceBatch` with the shapes and dtypes of its source."""
-    kind, shape = type(source).__name__, tuple(source.observation_shape)
+    kind = type(source).__name__
     if not isinstance(batch, SequenceBatch):
         raise ForbesError(f"{kind}: decode returns a {type(batch).__name__}, expected a SequenceBatch. Change decode")
     steps = tuple(batch.mask.shape)  # (B, T)
+    shapes, values = _by_name(source.observation_shape), _by_name(batch.observation)
+    if {*shapes} != {*values}:
+        raise ForbesError(
+            f"{kind}: decode returns {', '.join(values)}, expected {', '.join(shapes)}. Change decode or "
+            "observation_shape"
+        )
     expected: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
-        "observation": (torch.uint8 if len(shape) == 3 else torch.float32, (*steps, *shape)),
+        name: (torch.uint8 if len(shape) == 3 else torch.float32, (*steps, *shape)) for name, shape in shapes.items()
+    }
+    expected |= {
         "action": (torch.float32, (*steps, source.action_dim)),
         "reward": (torch.float32, steps),
         "mask": (torch.bool, steps[:2]),
         "state": (torch.float32, (*steps, batch.state.shape[-1])),
         "ended": (torch.bool, steps),
     }
+    values |= {name: getattr(batch, name) for name in batch._fields[1:]}
     for name, (dtype, size) in expected.items():
-        values: Tensor = getattr(batch, name)
-        if values.dtype != dtype or tuple(values.shape) != size:
+        found: Tensor = values[name]
+        if found.dtype != dtype or tuple(found.shape) != size:
             raise ForbesError(
-                f"{kind}: decode returns {name} {_name(values.dtype)} {tuple(values.shape)}, expected {_name(dtype)} "
+                f"{kind}: decode returns {name} {_name(found.dtype)} {tuple(found.shape)}, expected {_name(dtype)} "
                 f"{size}. Change decode, or observation_shape and action_dim"
             )
+
+
+def _by_name(observed: Any) -> dict[str, Any]:
+    """Return an observation or its parts, or the shapes of them, by name."""
+    if isinstance(observed, Mapping):
+        return {f"observation {name}": part for name, part in observed.items()}
+    return {"observation": observed}
 
 
 def _name(dtype: torch.dtype) -> str:

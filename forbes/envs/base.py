@@ -1,7 +1,7 @@
 """The interface of all environments: reset, step, and the shapes that an agent must know."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from forbes.errors import ForbesError, require_at_least
 from forbes.factors import Discrete, problem_of_discrete
-from forbes.shapes import printed_by_shape
+from forbes.shapes import Observed, Shape, is_shape, printed_by_shape
 
 __all__ = [
     "TIME_LIMIT",
@@ -32,8 +32,8 @@ TIME_LIMIT = 100_000
 class Step(NamedTuple):
     """The result of an action or a reset."""
 
-    observation: NDArray[Any]
-    """o_t, uint8 `(C, H, W)` for an image, float32 `(O,)` for a vector."""
+    observation: Observed
+    """o_t, uint8 `(C, H, W)` for an image, float32 `(O,)` for a vector; of several parts a dict of them by name."""
     reward: float = 0.0
     """r_t, summed over the frames of the step; 0 at a reset."""
     terminated: bool = False
@@ -53,8 +53,8 @@ class Environment(ABC):
     The same seed and actions must produce bitwise the same episode, regardless of what was played before.
     """
 
-    observation_shape: tuple[int, ...]
-    """Shape of an observation: `(C, H, W)` for images, `(O,)` for vectors."""
+    observation_shape: Shape
+    """Shape of an observation: `(C, H, W)` for images, `(O,)` for vectors; of several parts a dict of them by name."""
     action_dim: int
     """Dimension of an action, A."""
     discrete: Discrete = False
@@ -73,6 +73,8 @@ class Environment(ABC):
 
     def named_parts(self) -> dict[str, list[int]]:
         """Return the indices of the dimensions of a vector observation by name, for the view `hide`.
+
+        Of several parts, they are those of the only vector.
 
         Parts may overlap: `velocities` are those dimensions that depend on velocities.
         """
@@ -120,9 +122,11 @@ def check_environment(environment: Environment) -> None:
     """Raise a ForbesError unless an environment defines valid attributes and its task."""
     kind = type(environment).__name__
     shape = getattr(environment, "observation_shape", None)
-    valid = isinstance(shape, tuple | list) and len(shape) in (1, 3) and all(map(_is_positive_integer, shape))
-    if not valid:
-        raise ForbesError(f"{kind}: observation_shape is {shape}, expected (C, H, W) or (O,). Set it in the class")
+    if not is_shape(shape):
+        raise ForbesError(
+            f"{kind}: observation_shape is {shape}, expected (C, H, W), (O,) or a dict of these by part. Set it in the "
+            "class"
+        )
     for name in ("action_dim", "action_repeat"):
         if not _is_positive_integer(value := getattr(environment, name, None)):
             raise ForbesError(f"{kind}: {name} is {value}, expected an integer above 0. Set it in the class")
@@ -136,15 +140,27 @@ def _is_positive_integer(value: Any) -> bool:
     return isinstance(value, int | np.integer) and bool(value > 0)
 
 
-def check_step(step: Step, shape: tuple[int, ...]) -> None:
+def check_step(step: Step, shape: Shape) -> None:
     """Raise a ValueError unless a step is a `Step` of finite values, whose observation has this shape and its dtype."""
     if not isinstance(step, Step):
         raise ValueError(f"it returns a {type(step).__name__}, expected a Step")
-    observation, dtype = step.observation, "uint8" if len(shape) == 3 else "float32"
-    if observation.shape != shape or observation.dtype != dtype:
-        found = f"{observation.dtype} {observation.shape}"
-        raise ValueError(f"the observation is {found}, expected {dtype} {shape}")
-    if not np.isfinite(observation).all():
-        raise ValueError("the observation is not finite")
+    if isinstance(shape, Mapping):
+        names = sorted(step.observation) if isinstance(step.observation, Mapping) else "no parts"
+        if names != sorted(shape):
+            raise ValueError(f"the observation has {names}, expected the parts {sorted(shape)}")
+        for part, expected in shape.items():
+            _check_array(f"the observation's {part}", step.observation[part], expected)
+    else:
+        _check_array("the observation", step.observation, shape)
     if not np.isfinite(step.reward):
         raise ValueError(f"the reward is {step.reward}, expected a finite number")
+
+
+def _check_array(name: str, observation: Any, shape: tuple[int, ...]) -> None:
+    dtype = "uint8" if len(shape) == 3 else "float32"
+    if not isinstance(observation, np.ndarray):
+        raise ValueError(f"{name} is a {type(observation).__name__}, expected {dtype} {shape}")
+    if observation.shape != shape or observation.dtype != dtype:
+        raise ValueError(f"{name} is {observation.dtype} {observation.shape}, expected {dtype} {shape}")
+    if not np.isfinite(observation).all():
+        raise ValueError(f"{name} is not finite")

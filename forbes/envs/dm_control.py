@@ -16,6 +16,7 @@ from forbes.envs.base import Environment, Step, repeat, require_repeat, scale_ac
 from forbes.envs.rendering import choose_backend
 from forbes.envs.views import VELOCITIES
 from forbes.errors import ForbesError
+from forbes.shapes import Observed
 
 __all__ = ["DeepMindControl", "environment_variable", "measure"]
 
@@ -57,6 +58,7 @@ class DeepMindControl(Environment):
         size: side of the images in pixels.
         fast: render without shadows, which on a CPU take most of the time. This changes the pixels, so it is not for
             published results. Multisampling stays on: without it a thin pole vanishes in a small image.
+        proprio: with `pixels`, observe the measurements too: the parts `camera` and `proprio`.
         backend: OpenGL backend that is known to render. Default: the one of `choose_backend`.
 
     Raises:
@@ -78,10 +80,14 @@ class DeepMindControl(Environment):
         camera: int | None = None,
         size: int = 64,
         fast: bool = False,
+        proprio: bool = False,
         backend: str | None = None,
     ) -> None:
         require_repeat(task, action_repeat)
+        if proprio and not pixels:
+            raise ForbesError(f"{task}: proprio adds the measurements to images, expected pixels. Leave proprio out")
         self.task, self.pixels, self.action_repeat, self.size, self.fast = task, pixels, action_repeat, size, fast
+        self.proprio = proprio
         self.backend = (backend or choose_backend().backend) if pixels else _NO_RENDERING
         self._environment = _load(task, self.backend)
         spec = self._environment.action_spec()
@@ -91,9 +97,12 @@ class DeepMindControl(Environment):
                 f"{task}: its actions are unbounded, so [-1, 1] cannot be scaled to them. Choose another task"
             )
         self.camera = camera if camera is not None else 2 if task.startswith("quadruped") else 0
-        self.observation_shape = (3, size, size) if pixels else self.reset(0).observation.shape
+        self.observation_shape = (3, size, size)
         if pixels:
             self._prepare_rendering()
+        if proprio or not pixels:
+            measured = _measurements(self._environment.reset()).shape
+            self.observation_shape = {"camera": (3, size, size), "proprio": measured} if proprio else measured
 
     def _prepare_rendering(self) -> None:
         """Set the rendering options that cannot be changed after the first frame."""
@@ -122,9 +131,13 @@ class DeepMindControl(Environment):
 
         return repeat(frame, self.action_repeat)._replace(observation=self._observe(last))
 
-    def _observe(self, time_step: Any) -> NDArray[Any]:
+    def _observe(self, time_step: Any) -> Observed:
         if not self.pixels:
-            return np.concatenate([np.ravel(part) for part in time_step.observation.values()]).astype(np.float32)
+            return _measurements(time_step)
+        image = self._rendered()
+        return {"camera": image, "proprio": _measurements(time_step)} if self.proprio else image
+
+    def _rendered(self) -> NDArray[np.uint8]:
         frame = self._environment.physics.render(self.size, self.size, camera_id=self.camera)  # (H, W, 3)
         if (frame == frame[0, 0]).all():
             raise RuntimeError(f"{self.backend} renders a frame of one colour")
@@ -132,7 +145,7 @@ class DeepMindControl(Environment):
 
     def named_parts(self) -> dict[str, list[int]]:
         """Return the suite's measurements by name, and `velocities`: all numbers that depend on velocities."""
-        if self.pixels:
+        if self.pixels and not self.proprio:
             return {}
         parts: dict[str, list[int]] = {}
         for name, spec in self._environment.observation_spec().items():
@@ -147,7 +160,15 @@ class DeepMindControl(Environment):
         if not self.pixels:
             return {"task": self.task, "pixels": False, "made_by": made_by}
         made_by |= {"backend": self.backend, "gl_renderer": self._gl_renderer()}
-        return {"task": self.task, "pixels": True, "camera": self.camera, "fast": self.fast, "made_by": made_by}
+        shown = {"proprio": True} if self.proprio else {}
+        return {
+            "task": self.task,
+            "pixels": True,
+            "camera": self.camera,
+            "fast": self.fast,
+            **shown,
+            "made_by": made_by,
+        }
 
     def _gl_renderer(self) -> str:
         """Return the name of the device or software that renders."""
@@ -156,6 +177,13 @@ class DeepMindControl(Environment):
         with self._environment.physics.contexts.gl.make_current() as context:
             name: bytes = context.call(GL.glGetString, GL.GL_RENDERER)
         return name.decode()
+
+
+def _measurements(time_step: Any) -> NDArray[np.float32]:
+    """Return the task's measurements, float32 `(O,)`."""
+    measured = [np.ravel(part) for part in time_step.observation.values()]
+    vector: NDArray[np.float32] = np.concatenate(measured).astype(np.float32)
+    return vector
 
 
 def _load(task: str, backend: str) -> Any:

@@ -13,6 +13,7 @@ from forbes.envs.images import to_image
 from forbes.envs.views import VELOCITIES
 from forbes.errors import ForbesError
 from forbes.factors import discrete_of
+from forbes.shapes import Observed, map_parts, part_name
 
 __all__ = ["Gymnasium"]
 
@@ -28,7 +29,8 @@ class Gymnasium(Environment):
     Observations are images, uint8 `(C, H, W)`, if the space is a uint8 Box of 0 to 255 with 1, 3 or 4 channels or
     without a channel dimension. Otherwise they are float32 vectors: values of a Box, one-hot vectors for a Discrete or
     MultiDiscrete, and the concatenated parts of a Dict or Tuple. Integers of a Box with two bounds are scaled to
-    [0, 1], and text is ignored. With `pixels` the observation is the rendered image.
+    [0, 1], and text is ignored. A Dict with an image among other entries has an observation of several parts, one for
+    each entry. With `pixels` the observation is the rendered image.
 
     Actions of a Box are scaled from [-1, 1] to its bounds (`scale_action`), with equal intervals for integers. Actions
     of a Discrete are one-hot; those of a MultiDiscrete or MultiBinary have a one-hot vector for each of their choices.
@@ -41,6 +43,7 @@ class Gymnasium(Environment):
         action_repeat: number of Gymnasium steps per action. Their rewards are summed.
         size: side of the images in pixels. Default: 64 with `pixels`, otherwise the original size.
         part: entry of a Dict observation to use, e.g. `image` in MiniGrid. Default: all entries.
+        parts: entries of a Dict observation to use, each as a part of its own.
 
     Raises:
         ForbesError: for an unknown id, an unsupported space of actions or observations, or if gymnasium is not
@@ -61,23 +64,29 @@ class Gymnasium(Environment):
         action_repeat: int = 1,
         size: int | None = None,
         part: str | None = None,
+        parts: list[str] | None = None,
     ) -> None:
         require_repeat(task, action_repeat)
-        self.task, self.pixels, self.action_repeat, self.part = task, pixels, action_repeat, part
+        self.task, self.pixels, self.action_repeat = task, pixels, action_repeat
+        self.options = {name: value for name, value in (("part", part), ("parts", parts)) if value is not None}
         self.size = size or 64 if pixels else size
         self._environment = _make(task, pixels)
         from forbes.envs import gymnasium_spaces
 
         self._spaces = gymnasium_spaces
-        self._seen = _entry(task, self._environment.observation_space, part)
+        self._seen: dict[str, Any] = {}  # spaces of the entries of a Dict that are observed
+        self._space = self._environment.observation_space
         if not pixels:
-            self._spaces.require_observations(task, self._seen)
+            self._seen = _entries(task, self._space, part, parts)
+            for space in self._seen.values() or [self._space]:
+                self._spaces.require_observations(task, space)
+        self._single = parts is None and len(self._seen) == 1
         self._actions: Any = self._environment.action_space
         self._spaces.require_actions(task, self._actions)
         sizes = self._spaces.factors(self._actions)
         self.discrete = discrete_of(sizes)
         self.action_dim = sum(sizes) or int(np.prod(self._actions.shape))
-        self.observation_shape = self.reset(0).observation.shape
+        self.observation_shape = map_parts(np.shape, self.reset(0).observation)
 
     def reset(self, seed: int) -> Step:
         """Start the episode of a seed."""
@@ -96,20 +105,25 @@ class Gymnasium(Environment):
 
         return repeat(frame, self.action_repeat)._replace(observation=self._observe(last))
 
-    def _observe(self, observation: Any) -> NDArray[Any]:
+    def _observe(self, observation: Any) -> Observed:
         if self.pixels:
             return to_image(self._environment.render(), self.size)
-        if self.part is not None:
-            observation = observation[self.part]
-        if self._spaces.is_image(self._seen):
-            return to_image(observation, self.size)
-        return self._spaces.flatten(self._seen, observation)
+        if not self._seen:
+            return self._array(self._space, observation)
+        seen = {part_name(name): self._array(space, observation[name]) for name, space in self._seen.items()}
+        return next(iter(seen.values())) if self._single else seen
+
+    def _array(self, space: Any, value: Any) -> NDArray[Any]:
+        if self._spaces.is_image(space):
+            return to_image(value, self.size)
+        return self._spaces.flatten(space, value)
 
     def named_parts(self) -> dict[str, list[int]]:
         """Return the entries of a Dict or the parts of a MuJoCo environment by name, and `velocities` where known."""
-        if len(self.observation_shape) != 1:
+        if not isinstance(self.observation_shape, tuple) or len(self.observation_shape) != 1:
             return {}
-        sizes = self._spaces.sizes(self._seen)
+        [space] = self._seen.values() or [self._space]
+        sizes = self._spaces.sizes(space)
         structure: dict[str, int] = getattr(self._environment.unwrapped, "observation_structure", {})
         sizes |= {name: size for name, size in structure.items() if name != "skipped_qpos"}
         parts: dict[str, list[int]] = {}
@@ -122,9 +136,8 @@ class Gymnasium(Environment):
 
     def describe(self) -> dict[str, Any]:
         """Return task, kind of observation and version."""
-        part = {} if self.part is None else {"part": self.part}
         made_by = {"gymnasium": version("gymnasium")}
-        return {"task": f"gymnasium:{self.task}", "pixels": self.pixels, **part, "made_by": made_by}
+        return {"task": f"gymnasium:{self.task}", "pixels": self.pixels, **self.options, "made_by": made_by}
 
 
 def _make(task: str, pixels: bool) -> Any:
@@ -155,13 +168,20 @@ def _make(task: str, pixels: bool) -> Any:
     return environment
 
 
-def _entry(task: str, space: Any, part: str | None) -> Any:
-    """Return the space of an entry of a Dict, or the whole space."""
-    if part is None:
-        return space
-    names = list(getattr(space, "spaces", []))
-    if part not in names:
-        raise ForbesError(
-            f"{task}: part is {part!r}, expected one of {', '.join(map(str, names)) or 'a Dict'}. Choose one"
-        )
-    return space.spaces[part]
+def _entries(task: str, space: Any, part: str | None, parts: list[str] | None) -> dict[str, Any]:
+    """Return the spaces of the entries of a Dict to observe, by name; nothing if the whole space is one observation."""
+    from forbes.envs.gymnasium_spaces import is_image, is_text
+
+    inside = getattr(space, "spaces", None)
+    entries: dict[str, Any] = dict(inside) if isinstance(inside, dict) else {}
+    if part is None and parts is None:
+        shown = {name: entry for name, entry in entries.items() if not is_text(entry)}
+        return shown if any(map(is_image, shown.values())) else {}
+    if part is not None and parts is not None:
+        raise ForbesError(f"{task}: part and parts are both set, expected one of them. Remove one")
+    option, names = ("part", [part]) if parts is None else ("parts", parts)
+    for name in names or [""]:
+        if name not in entries:
+            expected = ", ".join(map(str, entries)) or "a Dict"
+            raise ForbesError(f"{task}: {option} is {name!r}, expected one of {expected}. Choose one")
+    return {str(name): entries[str(name)] for name in names}

@@ -11,8 +11,8 @@ from forbes.envs.images import CHANNELS
 from forbes.errors import ForbesError
 from forbes.factors import to_index
 
-__all__ = ["factors", "first_option", "flatten", "is_image", "require_actions", "require_observations", "sizes"]
-__all__ += ["to_action"]
+__all__ = ["factors", "first_option", "flatten", "is_image", "is_text", "require_actions", "require_observations"]
+__all__ += ["sizes", "to_action"]
 
 _FLAT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _REGISTER = "Wrap and register it in a module of your own, and use: gymnasium:MODULE:ID"
@@ -36,7 +36,7 @@ def flatten(space: Any, value: Any) -> NDArray[np.float32]:
         return np.concatenate([flatten(part, value[name]) for name, part in space.spaces.items()])
     if isinstance(space, spaces.Tuple):
         return np.concatenate([flatten(part, entry) for part, entry in zip(space.spaces, value, strict=True)])
-    if _is_text(space):
+    if is_text(space):
         return np.empty(0, np.float32)
     flat = np.asarray(spaces.flatten(space, value))  # (O,)
     if isinstance(space, spaces.Box) and flat.dtype.kind in "iu":
@@ -50,7 +50,7 @@ def sizes(space: Any) -> dict[str, int]:
     """Return how many numbers `flatten` makes of each entry of a Dict; of another space, nothing."""
     entries = space.spaces if isinstance(space, spaces.Dict) else {}
     return {
-        str(name): sum(0 if _is_text(leaf) else spaces.flatdim(leaf) for leaf in _parts(entry))
+        str(name): sum(0 if is_text(leaf) else spaces.flatdim(leaf) for leaf in _parts(entry))
         for name, entry in entries.items()
     }
 
@@ -58,12 +58,12 @@ def sizes(space: Any) -> dict[str, int]:
 def require_observations(task: str, space: Any) -> None:
     """Raise a ForbesError unless `flatten` supports every part of a space."""
     for part in _parts(space):
-        if not isinstance(part, _FLAT) and not _is_text(part):
+        if not isinstance(part, _FLAT) and not is_text(part):
             raise ForbesError(
                 f"{task}: its observations have a {type(part).__name__}, expected images, or numbers in Box, Discrete, "
                 f"MultiDiscrete, MultiBinary, Tuple and Dict. {_REGISTER}"
             )
-    if all(_is_text(part) for part in _parts(space)):
+    if all(is_text(part) for part in _parts(space)):
         raise ForbesError(f"{task}: its observations are text, expected numbers or images. {_REGISTER}")
 
 
@@ -114,7 +114,7 @@ def _bounds(space: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return low, high
 
 
-def _is_text(space: Any) -> bool:
+def is_text(space: Any) -> bool:
     """Return whether a space holds text. Packages define their own classes for it, e.g. MiniGrid for its mission."""
     return space.dtype is not None and space.dtype.kind == "U"
 

@@ -2,19 +2,24 @@
 
 A view changes observations only; rewards and the end of an episode stay as they are. It depends on nothing but the
 episode's seed, so an episode can be replayed.
+
+Of an observation of several parts, a view changes all parts, or those that its value names: `{camera: 0.1}`. `Hide` and
+`Occlude` need a name.
 """
 
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forbes.envs.base import Environment, Step, check_environment
+from forbes.envs.parts import OfPart, Part
 from forbes.errors import ForbesError
 from forbes.reading import is_number
+from forbes.shapes import Observed, map_parts, shape_of
 
 __all__ = ["VELOCITIES", "VIEWS", "BlankUntil", "Delay", "Flicker", "Hide", "Noise", "Occlude", "View", "look_through"]
 
@@ -35,16 +40,17 @@ class View(Environment):
 
     def __init__(self, environment: Environment, value: Any) -> None:
         self.environment, self.value = environment, value
-        self.observation_shape, self.action_dim = tuple(environment.observation_shape), environment.action_dim
+        self.observation_shape, self.action_dim = shape_of(environment.observation_shape), environment.action_dim
         self.discrete, self.action_repeat = environment.discrete, environment.action_repeat
 
     @abstractmethod
-    def show(self, observation: NDArray[Any]) -> NDArray[Any]:
+    def show(self, observation: Observed) -> Observed:
         """Return what is observed in place of o_t, in the same dtype. Called once a step."""
 
     def reset(self, seed: int) -> Step:
         """Start the episode of a seed, with random numbers that depend on the seed and the kind of view only."""
-        self._random, self._steps = np.random.default_rng([seed, *self.option.encode()]), 0
+        part = self.environment.part if isinstance(self.environment, Part) else ""
+        self._random, self._steps = np.random.default_rng([seed, *f"{self.option}{part}".encode()]), 0
         return self._shown(self.environment.reset(seed))
 
     def step(self, action: NDArray[np.float32]) -> Step:
@@ -63,6 +69,13 @@ class View(Environment):
         """Return the environment's description with `views`, in the order in which they are applied."""
         described = self.environment.describe()
         return described | {"views": [*described.get("views", []), {self.option: self.value}]}
+
+    def _array_shape(self) -> tuple[int, ...]:
+        """Return the shape of observations of one array. Of several parts, one must be named."""
+        if isinstance(shape := self.observation_shape, Mapping):
+            example = f"{{{next(iter(shape))}: {self.value!r}}}"
+            self._require(False, f"its value for one of the parts {', '.join(shape)}, e.g. {example}")
+        return shape_of(shape)  # type: ignore[return-value]
 
     def _require(self, valid: bool, expected: str) -> None:
         if not valid:
@@ -85,8 +98,9 @@ class Hide(View):
 
     def __init__(self, environment: Environment, parts: str | int | Sequence[str | int]) -> None:
         super().__init__(environment, parts)
-        self._require(len(self.observation_shape) == 1, "vectors to hide parts of, not images. `occlude` hides pixels")
-        (size,), named = self.observation_shape, environment.named_parts()
+        shape = self._array_shape()
+        self._require(len(shape) == 1, "vectors to hide parts of, not images. `occlude` hides pixels")
+        (size,), named = shape, environment.named_parts()
         wanted = [parts] if isinstance(parts, str | int) else list(parts)
         hidden: set[int] = set()
         for part in wanted:
@@ -127,9 +141,9 @@ class Flicker(View):
         super().__init__(environment, probability)
         self._require(is_number(probability) and 0 <= probability <= 1, "a probability in [0, 1]")
 
-    def show(self, observation: NDArray[Any]) -> NDArray[Any]:
+    def show(self, observation: Observed) -> Observed:
         """Return o_t, or zeros."""
-        return np.zeros_like(observation) if self._random.random() < self.value else observation
+        return _blank(observation) if self._random.random() < self.value else observation
 
 
 class Occlude(View):
@@ -147,10 +161,11 @@ class Occlude(View):
 
     def __init__(self, environment: Environment, box: Sequence[float]) -> None:
         super().__init__(environment, box)
-        self._require(len(self.observation_shape) == 3, "images to occlude, not vectors. `hide` leaves out dimensions")
+        shape = self._array_shape()
+        self._require(len(shape) == 3, "images to occlude, not vectors. `hide` leaves out dimensions")
         numbers = isinstance(box, list | tuple) and len(box) == 4 and all(is_number(x) and 0 <= x <= 1 for x in box)
         self._require(numbers, "left, top, right and bottom as fractions in [0, 1]")
-        self.value, (_, height, width) = list(box), self.observation_shape
+        self.value, (_, height, width) = list(box), shape
         left, top, right, bottom = (
             round(x * side) for x, side in zip(box, (width, height, width, height), strict=True)
         )
@@ -183,10 +198,13 @@ class Noise(View):
         super().__init__(environment, std)
         self._require(is_number(std) and 0 <= std < np.inf, "a standard deviation of at least 0")
 
-    def show(self, observation: NDArray[Any]) -> NDArray[Any]:
+    def show(self, observation: Observed) -> Observed:
         """Return the noisy observation."""
+        return map_parts(self._noisy, observation)
+
+    def _noisy(self, observation: NDArray[Any]) -> NDArray[Any]:
         noise: NDArray[np.float64] = self.value * self._random.standard_normal(observation.shape)
-        if len(self.observation_shape) == 1:
+        if observation.ndim == 1:
             return (observation + noise).astype(np.float32)
         return (observation + 255 * noise).round().clip(0, 255).astype(np.uint8)
 
@@ -204,12 +222,12 @@ class Delay(View):
     def __init__(self, environment: Environment, steps: int) -> None:
         super().__init__(environment, steps)
         self._require(type(steps) is int and steps >= 0, "a number of agent steps, at least 0")
-        self._late: deque[NDArray[Any]] = deque(maxlen=steps + 1)
+        self._late: deque[Observed] = deque(maxlen=steps + 1)
 
-    def show(self, observation: NDArray[Any]) -> NDArray[Any]:
+    def show(self, observation: Observed) -> Observed:
         """Return o_{t-k}."""
         if self._steps == 0:
-            self._late.extend([np.zeros_like(observation)] * self.value)
+            self._late.extend([_blank(observation)] * self.value)
         self._late.append(observation)
         return self._late[0]
 
@@ -228,9 +246,13 @@ class BlankUntil(View):
         super().__init__(environment, steps)
         self._require(type(steps) is int and steps >= 0, "a number of agent steps, at least 0")
 
-    def show(self, observation: NDArray[Any]) -> NDArray[Any]:
+    def show(self, observation: Observed) -> Observed:
         """Return zeros, then o_t."""
-        return np.zeros_like(observation) if self._steps < self.value else observation
+        return _blank(observation) if self._steps < self.value else observation
+
+
+def _blank(observation: Observed) -> Observed:
+    return map_parts(np.zeros_like, observation)
 
 
 VIEWS: dict[str, Callable[[Environment, Any], View]] = {
@@ -244,5 +266,9 @@ def look_through(make: Callable[[], Environment], views: dict[str, Any]) -> Envi
     environment = make()
     check_environment(environment)
     for option, value in views.items():
-        environment = VIEWS[option](environment, value)
+        if isinstance(environment.observation_shape, Mapping) and isinstance(value, Mapping):
+            for part, of_part in value.items():
+                environment = OfPart(environment, VIEWS[option], part, of_part)
+        else:
+            environment = VIEWS[option](environment, value)
     return environment

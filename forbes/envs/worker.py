@@ -23,6 +23,7 @@ from forbes.child import start_child
 from forbes.envs.base import TIME_LIMIT, Environment, Step, check_environment, check_step
 from forbes.errors import ForbesError
 from forbes.factors import Discrete
+from forbes.shapes import Shape, shape_of
 
 __all__ = ["BrokenEnvironmentError", "EnvironmentProcess"]
 
@@ -41,7 +42,7 @@ class BrokenEnvironmentError(ForbesError):
 class _Facts(NamedTuple):
     """Attributes of the environment, sent by the worker once it is built."""
 
-    observation_shape: tuple[int, ...]
+    observation_shape: Shape
     action_dim: int
     discrete: Discrete
     action_repeat: int
@@ -197,7 +198,7 @@ def _serve(connection: Connection, make: Callable[[], Environment]) -> None:
     try:
         environment = make()
         check_environment(environment)
-        shape = tuple(environment.observation_shape)
+        shape = shape_of(environment.observation_shape)
         numbers = (environment.action_dim, environment.discrete, environment.action_repeat)
         connection.send(_Facts(shape, *numbers, environment.describe()))
         while True:

@@ -10,7 +10,8 @@ An own likelihood is summed over all symbols, or compared with a normalised g th
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -29,11 +30,13 @@ from forbes.models import (
     Normal,
     OneHot,
     OnePixel,
+    PartsLikelihood,
     State,
     VectorNormal,
     has_posterior,
 )
 from forbes.seeding import forked
+from forbes.shapes import Observed, map_parts
 
 __all__ = ["check_model"]
 
@@ -94,7 +97,7 @@ def check_model(model: BeliefModel, data: SequenceData, where: str, needs: Seque
             raise ForbesError(f"{where}: its likelihood has no {name}, which is needed here. Implement it") from error
 
 
-def _check_methods(model: ModelAdapter, observation: Tensor, action: Tensor, where: str) -> None:
+def _check_methods(model: ModelAdapter, observation: Observed, action: Tensor, where: str) -> None:
     """Check what each method returns for one step."""
     rows, start = len(action), model.initial(len(action))
     _require_state(start, None, rows, "initial", where)
@@ -123,26 +126,27 @@ def _check_methods(model: ModelAdapter, observation: Tensor, action: Tensor, whe
     _require_shape(log_prob, (2, rows), "the log-likelihood", where)
 
 
-def _check_causality(model: BeliefModel, observation: Tensor, action: Tensor, where: str) -> None:
+def _check_causality(model: BeliefModel, observation: Observed, action: Tensor, where: str) -> None:
     """Exchange what follows a step, and then the other sequences; neither may change the belief after it."""
     drawn = _belief(model, observation, action)
     steps = action.shape[1]
     for seen in {1, steps // 2, steps - 1} - {0, steps}:
         later = torch.arange(steps, device=action.device) >= seen  # (T,)
-        other = _belief(model, _exchanged(observation, later), _exchanged(action, later))
+        exchanged = map_parts(partial(_exchanged, later=later), observation)
+        other = _belief(model, exchanged, _exchanged(action, later))
         if not _close(drawn[:, :seen], other[:, :seen]):
             raise ForbesError(
                 f"{where}: the belief after {seen} of {steps} steps depends on later observations, expected those so "
                 "far only. Look for a smoother, attention without a causal mask, or statistics over time in the encoder"
             )
-    changed = torch.cat((observation[:1], observation[1:].flip(1)))
+    changed = map_parts(lambda values: torch.cat((values[:1], values[1:].flip(1))), observation)
     if not _close(drawn[:1], _belief(model, changed, action)[:1]):
         raise ForbesError(
             f"{where}: the belief of a sequence depends on the others of its batch. Look for batch norm in train mode"
         )
 
 
-def _belief(model: BeliefModel, observation: Tensor, action: Tensor) -> Tensor:
+def _belief(model: BeliefModel, observation: Observed, action: Tensor) -> Tensor:
     """Return draws of the belief after each step, `(B, T, F)`; else the log-likelihood of the step, `(B, T, 1)`."""
     encoded = model.encode(observation, action.clone())
     if isinstance(model, ModelAdapter):
@@ -178,8 +182,15 @@ def _check_weights(model: BeliefModel, encoded: EncodedSequence, where: str) -> 
             )
 
 
-def _check_likelihood(likelihood: Likelihood, observation: Tensor, where: str) -> None:
+def _check_likelihood(likelihood: Likelihood, observation: Observed, where: str) -> None:
     """Check that an own likelihood with the name of one of forbes is about the same values."""
+    if isinstance(observation, Mapping):
+        if not isinstance(likelihood, PartsLikelihood) or {*likelihood.parts} != {*observation}:
+            raise ForbesError(
+                f"{where}: its likelihood is a {type(likelihood).__name__}, expected forbes.PartsLikelihood with the "
+                f"parts of the data, {', '.join(observation)}"
+            )
+        return
     rank, name = observation.ndim - 2, likelihood.name.partition("(")[0]
     if likelihood.rank != rank:
         raise ForbesError(

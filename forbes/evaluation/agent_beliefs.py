@@ -33,6 +33,7 @@ from forbes.models import Filtered
 from forbes.pomdps import Process
 from forbes.rounding import ceil_div
 from forbes.seeding import derive_seed, forked, generator
+from forbes.shapes import map_parts
 from forbes.training.acting import WorldModelAgent
 
 __all__ = ["DRAWS", "exact_variance", "filter_episode", "learned_variance", "non_gaussianity", "prior_and_posterior"]
@@ -61,7 +62,7 @@ def filter_episode(
         S trajectories of T + 1 steps, and the actions that were taken, `(T + 1, A)`, without gradients.
     """
     device = next(agent.parameters()).device
-    observation = torch.from_numpy(episode.observation.copy()).to(device)[None]  # (1, T + 1, *O)
+    observation = map_parts(lambda array: torch.from_numpy(array.copy()).to(device)[None], episode.observation)
     action = torch.from_numpy(episode.action.copy()).to(device)  # (T + 1, A)
     with torch.no_grad(), forked(device, seed):
         embedding = agent.model.embed(observation).expand(samples, -1, -1)  # (S, T + 1, E)

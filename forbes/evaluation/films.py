@@ -46,4 +46,5 @@ def film(camera: EnvironmentProcess, episode: Episode, seed: int) -> NDArray[np.
             f"{camera.describe()['task']}: the same seed and actions earn other rewards with pixels than without, "
             "expected the same episode. Make its rewards independent of pixels"
         )
-    return filmed.observation
+    images: NDArray[np.uint8] = filmed.observation
+    return images

@@ -72,7 +72,8 @@ def score_images(
         seed: random seed of the futures, which depend on nothing else but the batches.
     """
     device, kinds = next(model.parameters()).device, ["psnr"]
-    if min(source.observation_shape[1:]) >= _SMALLEST:
+    shape = source.observation_shape
+    if isinstance(shape, tuple) and min(shape[1:]) >= _SMALLEST:
         kinds.append("ssim")
     found: dict[str, list[MetricCollection]] = {"model": [], "last frame": []}
     for first, batch in batches:

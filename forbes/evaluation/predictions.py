@@ -92,8 +92,9 @@ def complete(
     r"""Filter the first `context` steps, draw N belief samples of (h, s), and roll each out to the batch's last step.
 
     Each sample keeps its own trajectory, so its completion is consistent over time. A model without randomness has one
-    trajectory. A frame is :math:`E[o_t \mid h_t, s_t]`. If observations are increments, it is the drawing so far: the
-    observed strokes plus sampled ones, :math:`o_u \sim p(\cdot \mid h_u, s_u)`, step by step.
+    trajectory. A frame is :math:`E[o_t \mid h_t, s_t]`; of several parts it has the images side by side. If
+    observations are increments, it is the drawing so far: the observed strokes plus sampled ones,
+    :math:`o_u \sim p(\cdot \mid h_u, s_u)`, step by step.
 
     Args:
         model: model on the batch's device.
@@ -110,7 +111,8 @@ def complete(
         >>> forbes.complete(model, data.source, batch, context=15, samples=10).frames.shape
         torch.Size([10, 8, 15, 1, 28, 28])
     """
-    encoded = model.encode(batch.observation[:, :context], batch.action[:, :context])
+    past = batch.first(context)
+    encoded = model.encode(past.observation, past.action)
     frames = _futures(model, source, batch, encoded, samples, draw=source.increments and not mean)
     return Completions(frames, context)
 
@@ -131,7 +133,8 @@ def expected_frames(
         context: number of steps that the model sees, c.
         futures: number of futures, K, in whole sets of particles. A model without randomness has one.
     """
-    encoded = model.encode(batch.observation[:, :context], batch.action[:, :context])
+    past = batch.first(context)
+    encoded = model.encode(past.observation, past.action)
     passes = model.num_belief_samples(futures)
     total: Tensor = _futures(model, source, batch, encoded, model.particles, draw=False).mean(0)
     for _ in range(passes - 1):  # one at a time: the memory does not grow with K
@@ -150,11 +153,11 @@ def _futures(
     start = model.sample_beliefs(encoded, samples)  # (N B, ...)
     action = batch.action[:, context:].repeat(samples, 1, 1)  # (N B, T - context, A)
     output = model.decode(model.imagine(start, action).features)  # (N B, T - context, C, H, W)
-    frames: Tensor = model.likelihood.sample(output) if draw else model.likelihood.mean(output)
+    frames = model.likelihood.images(model.likelihood.sample(output) if draw else model.likelihood.mean(output))
     if source.increments:
         before = batch.observation[:, :context].repeat(samples, 1, 1, 1, 1)  # (N B, context, C, H, W)
         frames = source.pictures(torch.cat((before.to(frames.dtype), frames), 1))[:, context:]
-    return frames.view(samples, len(batch.observation), *frames.shape[1:])  # (N, B, T - context, C, H, W)
+    return frames.view(samples, len(batch.mask), *frames.shape[1:])  # (N, B, T - context, C, H, W)
 
 
 @torch.no_grad()
@@ -169,10 +172,11 @@ def open_loop_frames(model: StateSpaceModel, batch: SequenceBatch, context: int)
         batch: B sequences of T steps, T above `context`.
         context: number of steps that the model sees.
     """
-    filtered = model.filter(model.embed(batch.observation[:, :context]), batch.action[:, :context])
+    past = batch.first(context)
+    filtered = model.filter(model.embed(past.observation), past.action)
     imagined = model.imagine(filtered.at(-1), batch.action[:, context:])
     features = torch.cat((filtered.features, imagined.features), 1)  # (B, T, H + D)
-    return model.likelihood.mean(model.decode(features))
+    return model.likelihood.images(model.likelihood.mean(model.decode(features)))
 
 
 def whole_sequences(data: SequenceData, split: Split, index: Tensor) -> SequenceBatch:

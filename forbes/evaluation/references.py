@@ -7,7 +7,8 @@ training split, and the previous observation,
 
 .. math:: \log p(o_{1:T}) = \sum_t \log N(o_t;\, \bar o, \sigma^2), \qquad \sum_t \log N(o_t;\, o_{t-1}, \sigma^2),
 
-where :math:`o_0 = \bar o`. For vectors also the linear prediction that fits the training split best,
+where :math:`o_0 = \bar o`. Of several parts, each is predicted so, if all have a Gaussian likelihood. For vectors also
+the linear prediction that fits the training split best,
 
 .. math:: \log p(o_{1:T}) = \sum_t \log N(o_t;\, A_1 o_{t-1} + A_2 o_{t-2} + B a_{t-1} + c,\, \sigma^2)
 
@@ -22,21 +23,21 @@ from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceData, Simulated, Split, Strokes
 from forbes.evaluation.ngram import fit_ngrams
-from forbes.models import Likelihood, Normal, SymlogNormal, VectorNormal
+from forbes.models import Likelihood, Normal, PartsLikelihood, SymlogNormal, VectorNormal
 from forbes.seeding import forked
 
 __all__ = ["lowest_above", "reference_means", "references"]
 
 _EXAMPLES, _ROWS = 500, 50
 """Number of training sequences that are averaged and fitted, and number of sequences decoded at a time."""
+_Gaussian = Normal | VectorNormal | SymlogNormal
 _NAMES = {3: ("mean frame", "last frame"), 1: ("mean observation", "last observation")}
 """Names of the constant predictions by rank of the observation."""
 
 
 def references(data: SequenceData, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
     """Return log p of each step of the first `count` sequences in nats, float64 `(N, T)`, by name; 0 on padding."""
-    known = isinstance(data.source, Simulated)
-    if isinstance(likelihood, Normal | VectorNormal | SymlogNormal) and not known:  # densities, also of strokes
+    if _is_gaussian(likelihood) and not isinstance(data.source, Simulated):  # a density, also of strokes
         with forked("cpu", 0):  # for the dequantisation noise of coarse pixels
             return _predictions(data, likelihood, split, count)
     if isinstance(data.source, Strokes):
@@ -57,11 +58,18 @@ def lowest_above(score: float, means: Mapping[str, float]) -> str | None:
     return min(above)[1] if above else None
 
 
+def _is_gaussian(likelihood: Likelihood) -> bool:
+    """Return whether a likelihood's parameters are a prediction of the target, of each part if there are several."""
+    parts = likelihood.parts.values() if isinstance(likelihood, PartsLikelihood) else [likelihood]
+    return all(isinstance(part, _Gaussian) for part in parts)
+
+
 @torch.no_grad()
 def _predictions(data: SequenceData, likelihood: Likelihood, split: Split, count: int) -> dict[str, Tensor]:
     """Return log p of each step by the mean, by the previous observation, and of vectors by the best linear map."""
     mean = _mean_target(data, likelihood)  # (*O)
-    weight = _least_squares(data, likelihood) if likelihood.rank == 1 else None  # (P, O)
+    vectors = isinstance(likelihood, VectorNormal | SymlogNormal)
+    weight = _least_squares(data, likelihood) if vectors else None  # (P, O)
     found: dict[str, list[Tensor]] = {}
     for index in torch.arange(count).split(_ROWS):
         batch = data.sequences(split, index)
@@ -83,9 +91,9 @@ def _train(data: SequenceData) -> Iterator[SequenceBatch]:
 
 def _mean_target(data: SequenceData, likelihood: Likelihood) -> Tensor:
     """Return the mean over all steps of training sequences, `(*O)`."""
-    total, steps = torch.zeros(data.observation_shape, dtype=torch.float64), 0
+    total, steps = torch.zeros((), dtype=torch.float64), 0
     for batch in _train(data):
-        total += likelihood.target(batch.observation)[batch.mask].sum(0)
+        total = total + likelihood.target(batch.observation)[batch.mask].sum(0)  # (*O)
         steps += int(batch.mask.sum())
     return (total / max(steps, 1)).float()  # (*O)
 

@@ -164,7 +164,9 @@ def data_sha256(data: SequenceData, split: Split, sequences: int) -> str:
     """Hash the first `sequences` sequences of a split, as the model sees them."""
     digest = hashlib.sha256()
     for _, batch in split_batches(data, split, sequences, batch_size=500):
-        for values in (batch.observation, batch.action, batch.mask):
+        parts = batch.observation
+        observed = [parts[name] for name in sorted(parts)] if isinstance(parts, dict) else [parts]
+        for values in (*observed, batch.action, batch.mask):
             digest.update(str(tuple(values.shape[1:])).encode())
             digest.update(values.numpy().tobytes())
     return digest.hexdigest()

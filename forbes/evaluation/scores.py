@@ -192,8 +192,9 @@ def score_open_loop(model: BeliefModel, batch: SequenceBatch, number: int, conte
         context: number of steps that the model observes, c, from 1 to T - 1.
     """
     mask = batch.mask[:, context:].double()  # (B, T - c)
-    encoded = model.encode(batch.observation[:, :context], batch.action[:, :context])
-    target = model.likelihood.target(batch.observation[:, context:]).flatten(0, 1)  # (B (T - c), *O)
+    past, later = batch.first(context), batch.after(context)
+    encoded = model.encode(past.observation, past.action)
+    target = model.likelihood.target(later.observation).flatten(0, 1)  # (B (T - c), *O)
     future = batch.action[:, context:].repeat(model.particles, 1, 1)  # (N B, T - c, A)
     joint, marginal = LogMeanExp(), LogMeanExp()
     for _ in range(model.num_belief_samples(number)):

@@ -13,6 +13,7 @@ from forbes.data.episodes.episode import Episode
 from forbes.figures.style import BLACK, GREY, ORANGE, paper_style
 from forbes.models import StateSpaceModel
 from forbes.seeding import forked
+from forbes.shapes import map_parts
 
 __all__ = ["curves", "dream"]
 
@@ -38,7 +39,7 @@ def dream(model: StateSpaceModel, episode: Episode, horizon: int, seed: int) -> 
         Means of the observations, `(T + 1, *O)`, in units of the likelihood.
     """
     device = model.initial(1).state.device
-    observation = torch.from_numpy(episode.observation.copy()).to(device)[None]  # (1, T + 1, *O)
+    observation = map_parts(lambda array: torch.from_numpy(array.copy()).to(device)[None], episode.observation)
     action = torch.from_numpy(episode.action.copy()).to(device)[None]  # (1, T + 1, A)
     steps = action.shape[1]
     with forked(device, seed):

@@ -1,6 +1,6 @@
 """Grids of frames: truth, observed frames and predictions (paper, Figure 4)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from forbes.errors import ForbesError
 from forbes.figures.episodes import MAX_CHANNELS, to_rgb
 from forbes.figures.style import BLACK, GREY, PAGE, paper_style
 from forbes.rounding import ceil_div
+from forbes.shapes import Shape
 
 __all__ = [
     "Bars",
@@ -22,6 +23,7 @@ __all__ = [
     "draw_panels",
     "is_image",
     "require_images",
+    "require_only_images",
     "seen_panel",
     "seen_steps",
     "truth_panel",
@@ -76,18 +78,36 @@ def seen_steps(context: int) -> list[int]:
     return sorted({ceil_div(context * part, 3) for part in (1, 2, 3)})
 
 
-def is_image(shape: Sequence[int]) -> bool:
-    """Return whether observations of this shape are images that `to_rgb` can convert."""
+def is_image(shape: Shape) -> bool:
+    """Return whether observations of this shape are images that `to_rgb` can convert, or have some among their parts.
+
+    All images of several parts must be such.
+    """
+    if isinstance(shape, Mapping):
+        images = [one for one in shape.values() if len(one) == 3]
+        return len(images) > 0 and all(map(is_image, images))
     return len(shape) == 3 and 1 <= shape[0] <= MAX_CHANNELS
 
 
-def require_images(where: str, shape: Sequence[int], remedy: str) -> None:
+def require_images(where: str, shape: Shape, remedy: str) -> None:
     """Raise a ForbesError, with this remedy, unless observations of this shape are images that `to_rgb` can convert."""
-    if not is_image(shape):
+    if is_image(shape):
+        return
+    if isinstance(shape, Mapping):
+        found = f"of the parts {shape}"
+    else:
         found = f"vectors of {shape[0]}" if len(shape) == 1 else f"of shape {tuple(shape)}"
-        raise ForbesError(
-            f"{where}: the observations are {found}, expected images of 1 to {MAX_CHANNELS} channels. {remedy}"
-        )
+    raise ForbesError(
+        f"{where}: the observations are {found}, expected images of 1 to {MAX_CHANNELS} channels. {remedy}"
+    )
+
+
+def require_only_images(where: str, shape: Shape, remedy: str) -> None:
+    """Raise a ForbesError as `require_images`, and if observations have several parts."""
+    if isinstance(shape, Mapping):
+        parts = ", ".join(shape)
+        raise ForbesError(f"{where}: the observations have the parts {parts}, expected images alone. {remedy}")
+    require_images(where, shape, remedy)
 
 
 def _frames(observation: Tensor, times: Sequence[int]) -> Tensor:

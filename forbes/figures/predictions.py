@@ -12,7 +12,7 @@ from forbes.evaluation.adapters import load_all
 from forbes.evaluation.digits.neighbours import TrainingPrefixes, last_frame
 from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
 from forbes.figures.families import RunFamily, group, require_same_data
-from forbes.figures.grids import Panel, draw_panels, require_images, seen_panel, truth_panel
+from forbes.figures.grids import Panel, draw_panels, require_only_images, seen_panel, truth_panel
 from forbes.seeding import forked
 
 __all__ = ["ambiguous_digits", "draw_predictions", "predictions"]
@@ -48,7 +48,7 @@ def draw_predictions(
     """
     trained = load_all(runs, model, data, needs=("sample", "mean"))
     for run in trained:
-        require_images(run.path, run.data.observation_shape, "Name runs of images, e.g. of strokes")
+        require_only_images(run.path, run.data.observation_shape, "Name runs of images, e.g. of strokes")
         if not run.data.source.size("test"):
             raise ForbesError(f"{run.path}: its data have no test split, from which sequences are drawn. Name others")
         if mean and not run.data.source.increments:

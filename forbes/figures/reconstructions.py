@@ -17,6 +17,7 @@ from forbes.figures.style import BLACK, Method
 from forbes.models import StateSpaceModel
 from forbes.runs.folder import RunFolder
 from forbes.seeding import forked
+from forbes.shapes import Observed
 
 __all__ = ["draw_reconstructions", "reconstructions"]
 
@@ -45,7 +46,7 @@ def draw_reconstructions(runs: Sequence[str], index: Sequence[int] = (0,), conte
         trained = load_runs([of_one[0].path for of_one in of_task.values()])
         batches = [_shown(run, index, context) for run in trained]
         for first, batch in enumerate(batches):
-            same = [place for place, other in enumerate(batches) if torch.equal(other.observation, batch.observation)]
+            same = [place for place, other in enumerate(batches) if _same(other.observation, batch.observation)]
             if same[0] == first:
                 chosen = {title: trained[place] for place, title in enumerate(of_task) if place in same}
                 name = task if len(same) == len(trained) else f"{task}-{'-'.join(chosen)}".replace(" ", "_")
@@ -68,8 +69,7 @@ def _shown(run: TrainedRun, index: Sequence[int], context: int) -> SequenceBatch
         raise ForbesError(f"--index: {run.path} has {len(rows)} sequences to draw, expected 0 to {len(rows) - 1}")
     batch = SequenceData(source, length=run.data.length, batch_size=1).sequences(split, rows[list(index)])
     batch = batch.first(int(batch.mask.sum(1).max()))  # (B, T, ...)
-    if not 0 < context < batch.observation.shape[1]:
-        steps = batch.observation.shape[1]
+    if not 0 < context < (steps := batch.mask.shape[1]):
         raise ForbesError(
             f"--context {context}: expected at least 1 and less than the length of the sequences, {steps}"
         )
@@ -94,7 +94,8 @@ def reconstructions(
         seed: random seed for the samples.
     """
     first = next(iter(models.values()))
-    truth = first.data.source.pictures(first.model.likelihood.picture(batch.observation))  # (B, T, C, H, W)
+    likelihood = first.model.likelihood
+    truth = first.data.source.pictures(likelihood.images(likelihood.picture(batch.observation)))  # (B, T, C, H, W)
     times = torch.linspace(1, truth.shape[1], min(_FRAMES, truth.shape[1])).round().long().tolist()
     rows: list[tuple[str, str, Tensor]] = [("truth", BLACK, truth)]
     for title, run in models.items():
@@ -112,12 +113,19 @@ def reconstructions(
     return draw_bands(bands)
 
 
+def _same(one: Observed, other: Observed) -> bool:
+    """Return whether two observations have the same parts and values."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+    return not isinstance(one, dict) and not isinstance(other, dict) and torch.equal(one, other)
+
+
 def _reconstructed(run: TrainedRun, batch: SequenceBatch) -> Tensor:
     """Return the mean frames along the posterior, `(B, T, C, H, W)`."""
     model = run.model
     assert isinstance(model, StateSpaceModel)
     filtered = model.filter(model.embed(batch.observation), batch.action)
-    return run.data.source.pictures(model.likelihood.mean(model.decode(filtered.features)))
+    return run.data.source.pictures(model.likelihood.images(model.likelihood.mean(model.decode(filtered.features))))
 
 
 def _predicted(run: TrainedRun, batch: SequenceBatch, context: int) -> Tensor:

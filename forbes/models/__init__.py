@@ -6,6 +6,7 @@ from forbes.models.elbo import ElboTerms, elbo_loss
 from forbes.models.likelihoods import Bernoulli, Likelihood, Normal, OneHot, OnePixel, SymlogNormal, VectorNormal
 from forbes.models.networks import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
 from forbes.models.particles import ParticleModel
+from forbes.models.parts import PartsDecoder, PartsEncoder, PartsLikelihood
 from forbes.models.pixels import PixelDecoder, PixelEncoder
 from forbes.models.posterior import Filtered, PosteriorModel, has_posterior
 from forbes.models.state_space import StateSpaceModel
@@ -29,6 +30,9 @@ __all__ = [
     "OneHot",
     "OnePixel",
     "ParticleModel",
+    "PartsDecoder",
+    "PartsEncoder",
+    "PartsLikelihood",
     "PixelDecoder",
     "PixelEncoder",
     "PosteriorModel",

@@ -23,6 +23,7 @@ from forbes.errors import ForbesError
 from forbes.models.base import BOUNDS, EncodedSequence, FrameLogProb, Rollout, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.posterior import Filtered, PosteriorModel
+from forbes.shapes import Observed
 
 __all__ = ["ModelAdapter"]
 
@@ -141,7 +142,7 @@ class ModelAdapter(PosteriorModel):
         """See `BeliefModel.bound_name`."""
         return f"elbo[{self.likelihood.name},S=1]"
 
-    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+    def lower_bound(self, observation: Observed, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Refuse: an adapter is only scored."""
         raise ForbesError(
             f"{type(self).__name__}: an adapter is scored, not trained. Train the model with its own code"

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from forbes.beliefs import BeliefFamily
 from forbes.configured import Configurable
 from forbes.models.elbo import KL, ElboTerms
-from forbes.models.likelihoods import Likelihood
+from forbes.models.likelihoods import Likelihood, sum_of_parts
 from forbes.models.networks import MLP, Decoder, Encoder
-from forbes.shapes import printed_by_shape
+from forbes.shapes import Observed, printed_by_shape
 
 __all__ = ["BOUNDS", "BeliefModel", "EncodedSequence", "FrameLogProb", "ModelFamily", "ModelParts", "RecurrentModel"]
 __all__ += ["Rollout", "State"]
@@ -149,11 +149,11 @@ class BeliefModel(Configurable, nn.Module, ABC):
         """Return (h_0, s_0), `(B, ...)`: the state before the first observation."""
 
     @abstractmethod
-    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+    def lower_bound(self, observation: Observed, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Estimate the lower bound on log p(o_1:T) that trains the model.
 
         Args:
-            observation: o_t as stored, `(B, T, *O)`.
+            observation: o_t as stored, `(B, T, *O)`, or its parts by name.
             action: a_{t-1}, `(B, T, A)`.
             mask: True where the step is no padding, `(B, T)`.
             kl: how the KL is differentiated, where the model has one.
@@ -203,23 +203,34 @@ class BeliefModel(Configurable, nn.Module, ABC):
         """Return how many independent samples of the belief have `number` particles together."""
         return number
 
-    def encode(self, observation: Tensor, action: Tensor) -> EncodedSequence:
+    def encode(self, observation: Observed, action: Tensor) -> EncodedSequence:
         """Encode stored observations `(B, T, *O)` and the actions that led to them `(B, T, A)`."""
         target = self._target(observation)
         return EncodedSequence(target, self.embed_target(target), action)
 
-    def embed(self, observation: Tensor) -> Tensor:
+    def embed(self, observation: Observed) -> Tensor:
         """Encode every frame: stored observations `(B, T, *O)` to e `(B, T, E)`."""
         return self.embed_target(self._target(observation))
 
-    def _target(self, observation: Tensor) -> Tensor:
+    def _target(self, observation: Observed) -> Tensor:
         return self.likelihood.target(observation)
 
     def log_likelihood(self, features: Tensor, target: Tensor) -> Tensor:
         """Return log p(o | features) in nats: `(*, F)` and `(*, *O)`, which broadcast, to `(*)`."""
+        return self.likelihood.log_prob(self._output(features), target)
+
+    def log_likelihood_by_part(self, features: Tensor, target: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return log p(o | features) as `log_likelihood`, and that of each part, where an observation has several."""
+        output = self._output(features)
+        parts = self.likelihood.log_prob_by_part(output, target)
+        if parts:
+            return sum_of_parts(parts), parts
+        return self.likelihood.log_prob(output, target), parts
+
+    def _output(self, features: Tensor) -> Tensor:
+        """Decode, in at least float32: in mixed precision the decoder's output is bfloat16."""
         output = self.decode(features)
-        precise = torch.promote_types(output.dtype, torch.float32)  # in mixed precision the decoder's is bfloat16
-        return self.likelihood.log_prob(output.to(precise), target)
+        return output.to(torch.promote_types(output.dtype, torch.float32))
 
 
 class RecurrentModel(BeliefModel):
@@ -247,7 +258,7 @@ class RecurrentModel(BeliefModel):
         embedding: Tensor = self.encoder(shown.flatten(0, 1)).to(target.dtype)  # (B T, E)
         return embedding.view(*target.shape[:2], -1)  # (B, T, E)
 
-    def _target(self, observation: Tensor) -> Tensor:
+    def _target(self, observation: Observed) -> Tensor:
         return self.likelihood.target(observation).to(self.gru.weight_hh.dtype)
 
     def decode(self, features: Tensor) -> Tensor:

@@ -38,6 +38,8 @@ class ElboTerms(NamedTuple):
     """True where the step counts, `(B, T)`."""
     auxiliary: Mapping[str, Tensor] = {}
     """Further losses by name, scalars in nats per step. They are part of the loss only, never of a reported bound."""
+    parts: Mapping[str, Tensor] = {}
+    """The reconstruction of each part of an observation of several, whose sum it is, `(B, T)` each."""
 
     @property
     def elbo(self) -> Tensor:

@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -10,9 +11,11 @@ from torch.nn.functional import log_softmax, one_hot, pad, softplus
 
 from forbes.errors import ForbesError
 from forbes.performance.fusion import fused
+from forbes.shapes import Observed
 from forbes.symlog import symexp, symlog
 
 __all__ = ["Bernoulli", "Likelihood", "Normal", "OneHot", "OnePixel", "SymlogNormal", "VectorNormal"]
+__all__ += ["sum_of_parts"]
 
 
 class Likelihood(ABC):
@@ -22,20 +25,24 @@ class Likelihood(ABC):
     rank: int
     """Dimensions of an observation: 3 of an image `(C, H, W)`, 1 of a vector `(O,)`."""
 
-    def check(self, observation: Tensor) -> None:  # noqa: B027  # most likelihoods take any value
+    def check(self, observation: Observed) -> None:  # noqa: B027  # most likelihoods take any value
         """Raise a ForbesError where stored observations `(*, *O)` have a value outside the density's support."""
 
     @abstractmethod
-    def target(self, observation: Tensor) -> Tensor:
+    def target(self, observation: Observed) -> Tensor:
         """Turn a stored observation into the values the encoder reads and the density is about, float32."""
 
     @abstractmethod
     def mean(self, output: Tensor) -> Tensor:
         """Return E[o | output], for pictures as a grey value in [0, 1]; shape of `output`."""
 
-    def picture(self, observation: Tensor) -> Tensor:
+    def picture(self, observation: Observed) -> Tensor:
         """Return a stored observation in the units of `mean`."""
         return self.target(observation)
+
+    def images(self, values: Tensor) -> Tensor:
+        """Return means or pictures as images to draw, `(*, C, H, W)`: here, the values themselves."""
+        return values
 
     @abstractmethod
     def sample(self, output: Tensor) -> Tensor:
@@ -44,6 +51,16 @@ class Likelihood(ABC):
     @abstractmethod
     def log_prob(self, output: Tensor, target: Tensor) -> Tensor:
         """Return log p(target | output) in nats: whole images `(*, C, H, W)`, or vectors `(*, O)`, to `(*)`."""
+
+    def log_prob_by_part(self, output: Tensor, target: Tensor) -> dict[str, Tensor]:
+        """Return log p of each part of an observation in nats, `(*)`; nothing where it is one array."""
+        return {}
+
+
+def sum_of_parts(parts: Mapping[str, Tensor]) -> Tensor:
+    """Return the log-likelihood of an observation from those of its parts, at least one."""
+    first, *others = parts.values()
+    return sum(others, first)
 
 
 class Bernoulli(Likelihood):

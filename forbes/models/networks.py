@@ -1,7 +1,7 @@
 """Networks of the world model: MLPs, image encoders and decoders (paper, appendix: Dreamer's)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import chain, pairwise
 from typing import Literal, TypeAlias
 
@@ -14,6 +14,7 @@ from forbes.performance.convolutions import convolve
 from forbes.performance.fusion import Elementwise, fused
 from forbes.performance.recurrence import Layer, prepare_mlp
 from forbes.performance.time_loop import TimeLoop
+from forbes.shapes import Shape
 
 __all__ = [
     "MLP",
@@ -25,6 +26,7 @@ __all__ = [
     "MLPEncoder",
     "NormSiLU",
     "activate",
+    "one_array",
     "transposed_kernels",
 ]
 
@@ -110,9 +112,9 @@ class Decoder(Configurable, nn.Module):
     """Features `(N, F)` to the likelihood's parameters, in the observation's shape."""
 
 
-EncoderFamily: TypeAlias = Callable[[tuple[int, ...]], Encoder]
+EncoderFamily: TypeAlias = Callable[[Shape], Encoder]
 """Builds an encoder from the observation's shape."""
-DecoderFamily: TypeAlias = Callable[[int, tuple[int, ...]], Decoder]
+DecoderFamily: TypeAlias = Callable[[int, Shape], Decoder]
 """Builds a decoder from (feature_dim, observation_shape)."""
 
 
@@ -130,10 +132,10 @@ class MLPEncoder(Encoder):
         torch.Size([7, 16])
     """
 
-    def __init__(self, observation_shape: tuple[int, ...], width: int = 200, layers: int = 2) -> None:
+    def __init__(self, observation_shape: Shape, width: int = 200, layers: int = 2) -> None:
         super().__init__()
         self.embedding_dim = width
-        self.net = MLP(math.prod(observation_shape), width, layers)
+        self.net = MLP(math.prod(one_array(observation_shape, "MLPEncoder")), width, layers)
 
     def forward(self, observation: Tensor) -> Tensor:
         """See `Encoder`."""
@@ -161,14 +163,14 @@ class MLPDecoder(Decoder):
     def __init__(
         self,
         feature_dim: int,
-        observation_shape: tuple[int, ...],
+        observation_shape: Shape,
         width: int = 200,
         layers: int = 2,
         output_bias: float = 0.0,
     ) -> None:
         super().__init__()
-        self.observation_shape = observation_shape
-        last = nn.Linear(width, math.prod(observation_shape))
+        self.observation_shape = one_array(observation_shape, "MLPDecoder")
+        last = nn.Linear(width, math.prod(self.observation_shape))
         if output_bias:
             nn.init.constant_(last.bias, output_bias)
         self.net = nn.Sequential(MLP(feature_dim, width, layers), last)
@@ -177,6 +179,17 @@ class MLPDecoder(Decoder):
         """See `Decoder`."""
         output: Tensor = self.net(features)
         return output.view(-1, *self.observation_shape)  # (N, *O)
+
+
+def one_array(observation_shape: Shape, name: str) -> tuple[int, ...]:
+    """Return the shape of observations that are one array; refuse those of several parts, for a network's name."""
+    if isinstance(observation_shape, Mapping):
+        role = "encoder" if name.endswith("Encoder") else "decoder"
+        raise ForbesError(
+            f"{name}: found observations of the parts {', '.join(observation_shape)}, expected one array. Use "
+            f"Parts{role.capitalize()} as model.{role}, with one {role} for each part"
+        )
+    return observation_shape
 
 
 def _convolutions(observation_shape: tuple[int, ...], role: str) -> tuple[int, list[int]]:
@@ -217,14 +230,15 @@ class ConvEncoder(Encoder):
         torch.Size([7, 1024])
     """
 
-    def __init__(self, observation_shape: tuple[int, ...], channels: int = 32) -> None:
+    def __init__(self, observation_shape: Shape, channels: int = 32) -> None:
         super().__init__()
-        layers, sides = _convolutions(observation_shape, "Encoder")
-        widths = [observation_shape[0], *(channels * 2**layer for layer in range(layers))]
+        shape = one_array(observation_shape, "ConvEncoder")
+        layers, sides = _convolutions(shape, "Encoder")
+        widths = [shape[0], *(channels * 2**layer for layer in range(layers))]
         blocks = [(nn.Conv2d(before, after, _KERNEL, stride=2), nn.ReLU()) for before, after in pairwise(widths)]
         self.net = nn.Sequential(*chain(*blocks))
         self.embedding_dim = widths[-1] * math.prod(sides)
-        self.pixels = math.prod(observation_shape[1:])
+        self.pixels = math.prod(shape[1:])
 
     def forward(self, observation: Tensor) -> Tensor:
         """See `Encoder`."""
@@ -256,11 +270,12 @@ class ConvDecoder(Decoder):
     """
 
     def __init__(
-        self, feature_dim: int, observation_shape: tuple[int, ...], channels: int = 32, output_bias: float = 0.0
+        self, feature_dim: int, observation_shape: Shape, channels: int = 32, output_bias: float = 0.0
     ) -> None:
         super().__init__()
-        layers, encoded = _convolutions(observation_shape, "Decoder")
-        depth, *sides = observation_shape
+        shape = one_array(observation_shape, "ConvDecoder")
+        layers, encoded = _convolutions(shape, "Decoder")
+        depth, *sides = shape
         first = [max(side - 1, 1) for side in encoded]
         self.start_shape = channels * 2 ** (min(sides).bit_length() - 2), *first  # (C_0, H_0, W_0)
         self.start = nn.Linear(feature_dim, math.prod(self.start_shape))

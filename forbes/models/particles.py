@@ -26,7 +26,7 @@ from forbes.models.elbo import KL, ElboTerms
 from forbes.models.posterior import Filtered, PosteriorModel
 from forbes.models.state_space import StateSpaceModel
 from forbes.performance.precision import full_precision
-from forbes.shapes import printed_by_shape
+from forbes.shapes import Observed, printed_by_shape
 
 __all__ = ["ParticleModel", "Particles", "effective_sample_size", "run_particles", "soft", "systematic"]
 __all__ += ["sample_weighted_beliefs", "systematic_resampling"]
@@ -202,7 +202,7 @@ class ParticleModel(StateSpaceModel):
         """See `BeliefModel.bound_name`."""
         return f"fivo[{self.likelihood.name},K={self.particles}]"
 
-    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+    def lower_bound(self, observation: Observed, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         r"""See `BeliefModel.lower_bound`: with K particles.
 
         The reconstruction is the weighted mean :math:`\sum_k W_t^k \log p(o_t \mid h_t^k, s_t^k)`, the KL what it

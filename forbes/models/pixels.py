@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.nn.functional import linear, relu
 
 from forbes.errors import ForbesError
-from forbes.models.networks import Decoder, Encoder
+from forbes.models.networks import Decoder, Encoder, one_array
+from forbes.shapes import Shape
 
 __all__ = ["PixelDecoder", "PixelEncoder"]
 
@@ -34,9 +35,9 @@ class PixelEncoder(Encoder):
         torch.Size([7, 16])
     """
 
-    def __init__(self, observation_shape: tuple[int, ...], width: int = 256) -> None:
+    def __init__(self, observation_shape: Shape, width: int = 256) -> None:
         super().__init__()
-        height, self.side = _sides(observation_shape, "Encoder")
+        height, self.side = _sides(one_array(observation_shape, "PixelEncoder"), "Encoder")
         self.embedding_dim = width
         self.pixel = nn.Embedding(height * self.side, width)
         self.row, self.column = nn.Embedding(height, width), nn.Embedding(self.side, width)
@@ -77,10 +78,10 @@ class PixelDecoder(Decoder):
         torch.Size([7, 1, 28, 28])
     """
 
-    def __init__(self, feature_dim: int, observation_shape: tuple[int, ...], width: int = 256, blocks: int = 1) -> None:
+    def __init__(self, feature_dim: int, observation_shape: Shape, width: int = 256, blocks: int = 1) -> None:
         super().__init__()
-        height, side = _sides(observation_shape, "Decoder")
-        self.observation_shape = observation_shape
+        self.observation_shape = one_array(observation_shape, "PixelDecoder")
+        height, side = _sides(self.observation_shape, "Decoder")
         self.first = nn.Linear(feature_dim, width)
         self.blocks = nn.ModuleList(
             nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))

@@ -1,12 +1,16 @@
 """Refuse parts of a world model that do not fit together."""
 
+from collections.abc import Mapping
+
 from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel
 from forbes.models.elbo import KL
 from forbes.models.likelihoods import Likelihood, Normal, VectorNormal
+from forbes.models.parts import PartsLikelihood
 from forbes.models.state_space import StateSpaceModel
+from forbes.shapes import Shape
 
-__all__ = ["require_mean", "require_path", "require_rank"]
+__all__ = ["likelihood_for", "require_mean", "require_path"]
 
 
 def require_path(kl: KL, model: BeliefModel) -> None:
@@ -23,19 +27,28 @@ def require_path(kl: KL, model: BeliefModel) -> None:
         )
 
 
-def require_rank(likelihood: Likelihood, observation_shape: tuple[int, ...]) -> None:
-    """Raise a ForbesError if a likelihood would sum over dimensions that are not those of an observation."""
+def likelihood_for(observation_shape: Shape, likelihood: Likelihood) -> Likelihood:
+    """Return the likelihood of observations of this shape, or raise a ForbesError if it does not fit them."""
+    if isinstance(likelihood, PartsLikelihood):
+        return likelihood.for_shape(observation_shape)
+    if isinstance(observation_shape, Mapping):
+        raise ForbesError(
+            f"WorldModel: the likelihood {type(likelihood).__name__} is of one array, found observations of the parts "
+            f"{', '.join(observation_shape)}. Use PartsLikelihood as model.likelihood, with one for each part"
+        )
     if likelihood.rank != len(observation_shape):
         others = {1: "VectorNormal or OneHot", 3: "Normal or Bernoulli"}.get(len(observation_shape), "your own")
         raise ForbesError(
             f"WorldModel: the likelihood {type(likelihood).__name__} is of observations of rank {likelihood.rank}, "
             f"found shape {(*observation_shape,)}. Choose {others} as model.likelihood"
         )
+    return likelihood
 
 
 def require_mean(likelihood: Likelihood) -> None:
     """Raise a ForbesError unless the decoder's output is the mean of the target, to which a center can be added."""
-    if not isinstance(likelihood, Normal | VectorNormal):
+    parts = likelihood.parts.values() if isinstance(likelihood, PartsLikelihood) else [likelihood]
+    if not all(isinstance(part, Normal | VectorNormal) for part in parts):
         raise ForbesError(
             f"WorldModel: center with the likelihood {type(likelihood).__name__}, expected Normal or VectorNormal. "
             "Leave center out"

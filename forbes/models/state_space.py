@@ -25,6 +25,7 @@ from forbes.models.posterior import Filtered, PosteriorModel
 from forbes.performance.precision import full_precision
 from forbes.performance.recurrence import prepare_gru
 from forbes.performance.time_loop import TimeLoop
+from forbes.shapes import Observed
 
 __all__ = ["StateSpaceModel"]
 
@@ -178,14 +179,14 @@ class StateSpaceModel(PosteriorModel, RecurrentModel):
         with full_precision(filtered.state):
             return self.prior.rsample(self.prior_context(filtered.hidden))
 
-    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+    def lower_bound(self, observation: Observed, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """See `BeliefModel.lower_bound`: with one posterior trajectory per sequence."""
         encoded = self.encode(observation, action)
         return self.bound(self.filter(encoded.embedding, action), encoded, mask, kl)
 
     def bound(self, filtered: Filtered, encoded: EncodedSequence, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Estimate the bound with a posterior trajectory, which `filter` has drawn for this sequence."""
-        reconstruction = self.log_likelihood(filtered.features, encoded.target)
+        reconstruction, parts = self.log_likelihood_by_part(filtered.features, encoded.target)
         with full_precision(filtered.state):
             prior_context = self.prior_context(filtered.hidden)  # (B, T, C)
             analytic = self.posterior.kl(filtered.context, self.prior, prior_context) if kl == "analytic" else None
@@ -193,4 +194,4 @@ class StateSpaceModel(PosteriorModel, RecurrentModel):
             if analytic is None and kl != "monte_carlo" and self.posterior.reparameterised:
                 log_posterior = self.posterior.path_log_prob(filtered.state, filtered.context)  # (B, T)
             sampled = log_posterior - self.prior.log_prob(filtered.state, prior_context)  # (B, T)
-        return ElboTerms(reconstruction, sampled, analytic, mask)
+        return ElboTerms(reconstruction, sampled, analytic, mask, parts=parts)

@@ -22,6 +22,7 @@ from forbes.models.elbo import KL, ElboTerms
 from forbes.performance.precision import full_precision
 from forbes.performance.recurrence import prepare_gru
 from forbes.performance.time_loop import TimeLoop
+from forbes.shapes import Observed
 
 __all__ = ["VectorModel"]
 
@@ -101,13 +102,13 @@ class VectorModel(RecurrentModel):
         """See `BeliefModel.num_belief_samples`: one is as good as many."""
         return 1
 
-    def lower_bound(self, observation: Tensor, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
+    def lower_bound(self, observation: Observed, action: Tensor, mask: Tensor, kl: KL = "analytic") -> ElboTerms:
         """Return log p(o_t | o_<t) as the reconstruction, a KL of 0, and the loss of the overshooting."""
         encoded = self.encode(observation, action)
         hidden = self.filter(encoded.embedding, action)
-        log_likelihood = self.log_likelihood(hidden, encoded.target)  # (B, T)
+        log_likelihood, parts = self.log_likelihood_by_part(hidden, encoded.target)  # (B, T)
         auxiliary = {"overshoot": self._overshoot(hidden, encoded, mask)}
-        return ElboTerms(log_likelihood, torch.zeros_like(log_likelihood), None, mask, auxiliary)
+        return ElboTerms(log_likelihood, torch.zeros_like(log_likelihood), None, mask, auxiliary, parts)
 
     def _run(self, hidden: Tensor, embedding: Tensor, action: Tensor) -> Tensor:
         """Return h after each (e, a), `(B, T, H)`: all inputs are known, so the loop holds the GRU only."""

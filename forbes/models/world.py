@@ -11,8 +11,9 @@ from forbes.models.base import ModelFamily, ModelParts
 from forbes.models.elbo import KL, FreeNats
 from forbes.models.likelihoods import Likelihood, Normal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
-from forbes.models.requirements import require_mean, require_path, require_rank
+from forbes.models.requirements import likelihood_for, require_mean, require_path
 from forbes.models.state_space import StateSpaceModel
+from forbes.shapes import Shape, size_of
 
 __all__ = ["Schedule", "World"]
 
@@ -32,7 +33,7 @@ class World(nn.Module):
         encoder: o_t to e_t, a class of `forbes.models.networks`.
         decoder: features to the likelihood's parameters, likewise.
         likelihood: what the decoder's output means; `Normal()` by default.
-        observation_shape: shape of one observation; the command line takes it from the data.
+        observation_shape: shape of one observation, or of its parts by name; the command line takes it from the data.
         action_dim: dimensions of an action, A; the command line takes it from the data.
         state_dim: dimensions of s, D; 0 for a `VectorModel`.
         hidden_dim: dimensions of h, the GRU's state, H.
@@ -66,7 +67,7 @@ class World(nn.Module):
         encoder: EncoderFamily = ConvEncoder,
         decoder: DecoderFamily = ConvDecoder,
         likelihood: Likelihood | None = None,
-        observation_shape: tuple[int, ...] = (3, 64, 64),
+        observation_shape: Shape = (3, 64, 64),
         action_dim: int = 0,
         state_dim: int = 30,
         hidden_dim: int = 200,
@@ -88,8 +89,7 @@ class World(nn.Module):
         self.learning_rate, self.seed, self.schedule, self.warmup = learning_rate, seed, schedule, warmup
         require_at_least(1, "WorldModel", hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers)
         require_at_least(0, "WorldModel", state_dim=state_dim, learning_rate=learning_rate, clip_norm=clip_norm)
-        likelihood = likelihood or Normal()
-        require_rank(likelihood, observation_shape)
+        likelihood = likelihood_for(observation_shape, likelihood or Normal())
         self.model = model(
             ModelParts(
                 belief=belief,
@@ -109,6 +109,7 @@ class World(nn.Module):
         activate(self.model, activation)
         if center:
             require_mean(likelihood)
-            self.model.center = torch.zeros(observation_shape)
+            shape = (size_of(observation_shape),) if isinstance(observation_shape, dict) else observation_shape
+            self.model.center = torch.zeros(shape)
         self.kl, self.free_nats, self.free_nats_per, self.kl_warmup = kl, free_nats, free_nats_per, kl_warmup
         self.clip_norm = clip_norm

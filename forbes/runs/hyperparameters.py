@@ -58,6 +58,8 @@ def _plain(value: Any) -> Any:
         return int(value) if isinstance(value, Integral) else float(value)
     if isinstance(value, tuple | list):
         return [_plain(item) for item in value]
+    if isinstance(value, Mapping):
+        return plain_arguments(value)
     if isinstance(value, partial):
         return {"class_path": _path(value.func), "init_args": plain_arguments(value.keywords)}
     if isinstance(value, Likelihood):

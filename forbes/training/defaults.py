@@ -1,10 +1,26 @@
 """Defaults of a world model by its data: the values of `configs/`."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from forbes.beliefs import FlowBelief
 from forbes.data import SequenceSource, Simulated, Strokes
-from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, OneHot, OnePixel, PixelDecoder, PixelEncoder, VectorNormal
+from forbes.models import (
+    Bernoulli,
+    ConvDecoder,
+    ConvEncoder,
+    MLPDecoder,
+    MLPEncoder,
+    Normal,
+    OneHot,
+    OnePixel,
+    PartsDecoder,
+    PartsEncoder,
+    PartsLikelihood,
+    PixelDecoder,
+    PixelEncoder,
+    VectorNormal,
+)
 from forbes.pomdps.hmm import FiniteProcess
 
 __all__ = ["defaults_for"]
@@ -16,15 +32,26 @@ def defaults_for(source: SequenceSource) -> dict[str, Any]:
     Digit strokes have those of `configs/strokes/forbes.yaml` where a frame has at most one pixel, otherwise those of
     `configs/strokes/whole/forbes.yaml`. Known processes have those of `configs/pomdp`, with one-hot or normal
     observations. Other vectors have MLPs and a normal likelihood. Other images keep the defaults of the class, those of
-    DeepMind Control.
+    DeepMind Control. Each of several parts has those of its kind.
     """
     if isinstance(source, Strokes):
         return _one_pixel() if source.increments and source.points_per_step == 1 else _whole_frames()
     if isinstance(source, Simulated):
         return _process(finite=isinstance(source.process, FiniteProcess))
+    if isinstance(source.observation_shape, Mapping):
+        return _parts(source.observation_shape)
     if len(source.observation_shape) == 1:
         return {"encoder": MLPEncoder, "decoder": MLPDecoder, "likelihood": VectorNormal()}
     return {}
+
+
+def _parts(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    images = {name: len(shape) == 3 for name, shape in shapes.items()}
+    return {
+        "encoder": PartsEncoder.configured(parts={n: ConvEncoder if images[n] else MLPEncoder for n in images}),
+        "decoder": PartsDecoder.configured(parts={n: ConvDecoder if images[n] else MLPDecoder for n in images}),
+        "likelihood": PartsLikelihood({n: Normal() if images[n] else VectorNormal() for n in images}),
+    }
 
 
 def _one_pixel() -> dict[str, Any]:

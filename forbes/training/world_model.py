@@ -42,7 +42,7 @@ class WorldModel(World, SeededModule):
         encoder: o_t to e_t, a class of `forbes.models.networks`.
         decoder: features to the likelihood's parameters, likewise.
         likelihood: what the decoder's output means; `Normal()` by default.
-        observation_shape: shape of one observation; the command line takes it from the data.
+        observation_shape: shape of one observation, or of its parts by name; the command line takes it from the data.
         action_dim: dimensions of an action, A; the command line takes it from the data.
         state_dim: dimensions of s, D; 0 for a `VectorModel`.
         hidden_dim: dimensions of h, the GRU's state, H.
@@ -190,6 +190,8 @@ class WorldModel(World, SeededModule):
             **terms.auxiliary,
         }
         values = {self.objective_name: terms.elbo.mean()} | {name: parts[name] for name in self.model.logged_terms}
+        for name, log_prob in terms.parts.items():
+            values[f"reconstruction/{name}"] = (log_prob * terms.mask).sum(1).mean()
         return {name: value.detach() for name, value in values.items()}
 
 

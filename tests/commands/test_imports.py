@@ -50,7 +50,7 @@ def test_an_import_trains_and_is_exported(recorded, tmp_path, capsys):
             ["--image", "picture"],
             "--image picture: no such key. There are action, image, is_first, is_terminal, reward",
         ),
-        (["--proprio", "image", "--image", "image"], "--image image and --proprio image exclude each other"),
+        (["--proprio", "image", "--image", "image"], "--image image and --proprio image are the same key"),
         (["--action", "push"], "--action push: no such key"),
         (["--format", "arrays"], "truncated or not arrays"),
         (["--fps", "5"], "--fps 5 needs the rate of the data, which dreamer has not"),
@@ -69,7 +69,10 @@ def test_several_observations_are_refused_with_their_keys(tmp_path, capsys):
 
     sentence = error_of(capsys, "data", "import", path, "-o", tmp_path / "store")
 
-    assert "choose --image observation.images.top or --proprio observation.state" in sentence
+    assert (
+        "Choose some of --image observation.images.top --proprio observation.state; each image becomes a part"
+        in sentence
+    )
 
 
 @pytest.mark.parametrize(

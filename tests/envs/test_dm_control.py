@@ -174,3 +174,25 @@ def test_importing_the_suite_for_another_backend_is_refused():
         ForbesError, match=rf"has imported dm_control with MUJOCO_GL=.*, expected {other}.*EnvironmentProcess"
     ):
         DeepMindControl("cartpole_swingup", backend=other)
+
+
+def test_image_and_proprioception_are_those_of_each_alone(backend):
+    options = {"pixels": {}, "vector": {"pixels": False}, "both": {"proprio": True}}
+    seen = {}
+    for name, given in options.items():
+        extra = given if name == "vector" else given | {"backend": backend, "size": 32}
+        with EnvironmentProcess(find_environment("cartpole_swingup", **extra)) as environment:
+            first = environment.reset(3)
+            seen[name] = [first.observation, environment.step(np.ones(1, np.float32)).observation]
+            shape, described = environment.observation_shape, environment.describe()
+
+    assert shape == {"camera": (3, 32, 32), "proprio": (5,)}
+    assert described["proprio"] is True
+    for alone, vector, both in zip(seen["pixels"], seen["vector"], seen["both"], strict=True):
+        np.testing.assert_array_equal(both["camera"], alone)
+        np.testing.assert_array_equal(both["proprio"], vector)
+
+
+def test_proprioception_needs_pixels():
+    with pytest.raises(ForbesError, match="proprio adds the measurements to images, expected pixels"):
+        DeepMindControl("cartpole_swingup", pixels=False, proprio=True)

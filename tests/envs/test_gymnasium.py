@@ -30,6 +30,7 @@ from forbes.envs import Gymnasium, find_environment  # noqa: E402
 from forbes.envs.base import check_environment, check_step  # noqa: E402
 from forbes.errors import ForbesError  # noqa: E402
 from forbes.factors import factor_sizes, to_one_hot  # noqa: E402
+from forbes.shapes import shape_of  # noqa: E402
 
 
 class Camera(gymnasium.Env):
@@ -276,9 +277,54 @@ def test_a_package_that_registers_as_minigrid_does_is_collected(tmp_path):
     assert main([*collect, "-o", str(folder)]) == 0
 
     episode = EpisodeStore(folder).episode(1)
-    assert episode.observation.shape == (5, 4 + 7 * 7 * 3)
-    np.testing.assert_array_equal(episode.observation[:, :4], np.eye(4)[[2] * 5])
-    np.testing.assert_array_equal(episode.observation[:, 4:], np.float32(51 / 255))
+    assert {*episode.observation} == {"image", "direction"}  # text is left out
+    np.testing.assert_array_equal(episode.observation["direction"], np.eye(4)[[2] * 5])
+    np.testing.assert_array_equal(episode.observation["image"], np.full((5, 3, 7, 7), 51))
+
+
+@pytest.mark.parametrize(
+    ("options", "shape"),
+    [
+        ({}, {"direction": (4,), "image": (3, 7, 7)}),
+        ({"parts": ["image", "direction"]}, {"direction": (4,), "image": (3, 7, 7)}),
+        ({"parts": ["direction"]}, {"direction": (4,)}),
+        ({"part": "direction"}, (4,)),
+        ({"part": "image"}, (3, 7, 7)),
+        ({"size": 14}, {"direction": (4,), "image": (3, 14, 14)}),
+    ],
+    ids=["all", "both", "one of several", "vector", "image", "resized"],
+)
+def test_entries_of_a_dict_are_parts_where_one_is_an_image(options, shape):
+    environment = find_environment("gymnasium:toy_gymnasium:Toy-Rooms-v0", **options)()
+
+    assert environment.observation_shape == shape
+    check_environment(environment)
+    check_step(environment.reset(0), shape_of(shape))
+
+
+def test_a_dict_of_vectors_stays_one_vector_unless_parts_are_named(monkeypatch):
+    space = Dict({"robot.arm": Box(-1, 1, (2,)), "goal": Box(-1, 1, (1,))})
+    value = {"robot.arm": np.ones(2, np.float32), "goal": np.zeros(1, np.float32)}
+
+    assert environment_of(monkeypatch, space, value).observation_shape == (3,)
+    named = environment_of(monkeypatch, space, value, parts=["robot.arm", "goal"])
+    assert named.observation_shape == {"robot_arm": (2,), "goal": (1,)}
+    assert named.describe()["parts"] == ["robot.arm", "goal"]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"parts": ["image", "sound"]}, "parts is 'sound', expected one of direction, image, mission"),
+        ({"parts": []}, "parts is '', expected one of direction"),
+        ({"part": "image", "parts": ["direction"]}, "part and parts are both set"),
+        ({"parts": ["mission"]}, "its observations are text"),
+    ],
+    ids=["unknown", "none", "both", "text"],
+)
+def test_entries_that_cannot_be_parts_are_refused(options, sentence):
+    with pytest.raises(ForbesError, match=sentence):
+        find_environment("gymnasium:toy_gymnasium:Toy-Rooms-v0", **options)()
 
 
 @pytest.fixture

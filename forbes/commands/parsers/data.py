@@ -136,6 +136,12 @@ def _add_collect(of_data: _Parser) -> None:
     )
     play.add_argument("--part", help="in Gymnasium: entry of a Dict observation to use (default: all of them)")
     play.add_argument(
+        "--parts", nargs="+", metavar="PART", help="in Gymnasium: entries of a Dict to observe, each as a part"
+    )
+    play.add_argument(
+        "--proprio", action="store_const", const=True, help="in DeepMind Control: observe the measurements, too"
+    )
+    play.add_argument(
         "--camera", type=int, help="in DeepMind Control: index of the camera (default: 0, for quadruped 2)"
     )
     play.add_argument(
@@ -197,8 +203,9 @@ def _add_imports(of_data: _Parser) -> None:
         "-o", "--output", type=Path, required=True, metavar="DIR", help=f"{_STORED}, which must not exist"
     )
     take.add_argument("--format", choices=FORMATS, help="format of FROM (default: the one that recognises it)")
-    take.add_argument("--image", metavar="KEY", help="key of the observation, if it is an image")
-    take.add_argument("--proprio", metavar="KEY", nargs="+", help="keys of the observation, if it is a vector; joined")
+    several = "; images and vectors, or several images, become parts of the observation"
+    take.add_argument("--image", metavar="KEY", nargs="+", help=f"keys of images of the observation{several}")
+    take.add_argument("--proprio", metavar="KEY", nargs="+", help="keys of vectors of the observation, joined to one")
     take.add_argument("--action", metavar="KEY", help="key of the action (default: by the format's usual name)")
     sizes = "options of each choice in a discrete action, e.g. 3 2 (default: as the format or the values say)"
     take.add_argument("--action-sizes", type=positive, nargs="+", metavar="N", help=sizes)

@@ -13,6 +13,7 @@ from forbes.envs import BrokenEnvironmentError, Environment, Step
 from forbes.errors import ForbesError
 from forbes.factors import as_plain, factor_sizes, to_one_hot
 from forbes.seeding import derive_seed
+from forbes.shapes import Observed, map_parts, plain_shape
 
 __all__ = [
     "ATTEMPTS",
@@ -26,7 +27,7 @@ __all__ = [
     "random_policy",
 ]
 
-EpisodePolicy: TypeAlias = Callable[[NDArray[Any]], NDArray[np.float32]]
+EpisodePolicy: TypeAlias = Callable[[Observed], NDArray[np.float32]]
 """Function that chooses a_t, float32 `(A,)`, given o_t. It is used for one episode only and may have a memory."""
 MakePolicy: TypeAlias = Callable[[Environment, int], EpisodePolicy]
 """Function that makes the policy of an episode from the environment and a random seed."""
@@ -64,12 +65,16 @@ def play(environment: Environment, policy: EpisodePolicy, seed: int) -> Episode:
         steps.append(step)
         actions.append(action)
     return Episode(
-        observation=np.stack([step.observation for step in steps]),  # (T + 1, ...)
+        observation=map_parts(_stacked, *(step.observation for step in steps)),  # (T + 1, ...)
         action=np.stack(actions),  # (T + 1, A)
         reward=np.array([0.0, *(step.reward for step in steps[1:])], np.float32),  # (T + 1,)
         terminated=step.terminated,
         frames=sum(step.frames for step in steps[1:]),
     )
+
+
+def _stacked(*observations: NDArray[Any]) -> NDArray[Any]:
+    return np.stack(observations)
 
 
 def collect_episodes(
@@ -140,7 +145,7 @@ def play_whole(
 def describe_environment(environment: Environment) -> dict[str, Any]:
     """Return the description of an environment for the record of an episode."""
     return environment.describe() | {
-        "observation_shape": list(environment.observation_shape),
+        "observation_shape": plain_shape(environment.observation_shape),
         "action_dim": environment.action_dim,
         "discrete": as_plain(environment.discrete),
         "action_repeat": environment.action_repeat,

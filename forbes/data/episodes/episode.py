@@ -12,7 +12,7 @@ import mmap
 import os
 import struct
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -23,18 +23,14 @@ from forbes.envs import TIME_LIMIT
 from forbes.errors import ForbesError
 from forbes.factors import as_discrete, problem_of_choices, problem_of_discrete
 from forbes.reading import is_number, readable, shortened
-from forbes.shapes import printed_by_shape
+from forbes.shapes import NAMES, Observed, is_names, is_shape, map_parts, printed_by_shape
 
 __all__ = ["DamagedEpisodeError", "Episode", "EpisodeFile", "EpisodeRecord", "Stamp", "locate_episode", "map_episode"]
-__all__ += ["describe_episode", "pack_episode", "problem_of", "problem_with", "read_record", "stamp_of"]
+__all__ += ["arrays_of", "describe_episode", "pack_episode", "problem_of", "problem_with", "read_record", "stamp_of"]
 
-_ARRAYS = ("observation", "action", "reward")
-_KINDS = {
-    "observation": (("|u1", 4), ("<f4", 2)),
-    "action": (("<f4", 2),),
-    "reward": (("<f4", 1),),
-}
-"""Possible dtypes and numbers of dimensions of each array."""
+_OBSERVATION = (("|u1", 4), ("<f4", 2))
+_KINDS = {"action": (("<f4", 2),), "reward": (("<f4", 1),)}
+"""Possible dtypes and numbers of dimensions of an observation or a part of it, and of the other arrays."""
 _SHOWN = 60  # characters of an invalid value in an error message
 _LOCAL_HEADER = 30  # bytes before the name of a member of a zip archive
 
@@ -57,8 +53,8 @@ class Episode(NamedTuple):
         3.0
     """
 
-    observation: NDArray[Any]
-    """o_t, uint8 `(T + 1, C, H, W)` or float32 `(T + 1, O)`."""
+    observation: Observed
+    """o_t, uint8 `(T + 1, C, H, W)` or float32 `(T + 1, O)`; of several parts a dict of such arrays by name."""
     action: NDArray[np.float32]
     """a_{t-1}, `(T + 1, A)`, in [-1, 1] or one-hot, see `Environment.discrete`."""
     reward: NDArray[np.float32]
@@ -83,7 +79,7 @@ _FITS: dict[Any, Callable[[Any], bool]] = {
 }
 _ENVIRONMENT: dict[str, Callable[[Any], bool]] = {
     "task": _FITS[str],
-    "observation_shape": lambda value: type(value) is list and len(value) in (1, 3) and all(map(_is_size, value)),
+    "observation_shape": lambda value: type(value) in (list, dict) and is_shape(value),
     "action_dim": lambda value: _is_size(value),
     "discrete": lambda value: type(value) is bool or (type(value) is list and all(map(_is_size, value))),
 }
@@ -139,14 +135,29 @@ class DamagedEpisodeError(ForbesError):
         self.reason = reason
 
 
+def arrays_of(episode: Episode) -> dict[str, Any]:
+    """Return the arrays of an episode by the names of their members in its file, those of the observation first.
+
+    An observation of several parts has a member for each: `observation/camera`.
+    """
+    observed: dict[str, Any] = {"observation": episode.observation}
+    if isinstance(parts := episode.observation, Mapping):
+        observed = {f"observation/{name}": parts[name] for name in sorted(parts)}
+    return observed | {"action": episode.action, "reward": episode.reward}
+
+
 def problem_of(episode: Episode) -> str:
     """Return what is wrong with the arrays of an episode, or an empty string."""
-    count = len(np.atleast_1d(episode.observation))
-    for name in _ARRAYS:
-        if not isinstance(array := getattr(episode, name), np.ndarray):
+    if isinstance(episode.observation, Mapping) and not is_names(episode.observation):
+        return f"its observation has parts named {shortened(str([*episode.observation]), _SHOWN)}, expected {NAMES}"
+    arrays = arrays_of(episode)
+    count = len(np.atleast_1d(next(iter(arrays.values()))))
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray):
             return f"its {name} is a {type(array).__name__}, expected an array"
-        if (array.dtype.str, array.ndim) not in _KINDS[name] or not 2 <= len(array) == count:
-            kinds = " or ".join(f"{np.dtype(dtype)} of rank {rank}" for dtype, rank in _KINDS[name])
+        expected = _KINDS.get(name, _OBSERVATION)
+        if (array.dtype.str, array.ndim) not in expected or not 2 <= len(array) == count:
+            kinds = " or ".join(f"{np.dtype(dtype)} of rank {rank}" for dtype, rank in expected)
             return f"its {name} is {array.dtype} {array.shape}, expected {kinds}, with {count} and at least 2 steps"
         if not np.isfinite(array).all():
             return f"its {name} is not finite at step {np.argwhere(~np.isfinite(array))[0, 0]}"
@@ -177,7 +188,8 @@ def problem_with(environment: dict[str, Any], episode: Episode) -> str:
 def _problem_with_shapes(environment: dict[str, Any], episode: Episode) -> str:
     if problem := problem_of_environment(environment):
         return problem
-    arrays = {"observation_shape": list(episode.observation.shape[1:]), "action_dim": episode.action.shape[1]}
+    shape = map_parts(lambda array: list(array.shape[1:]), episode.observation)
+    arrays = {"observation_shape": shape, "action_dim": episode.action.shape[1]}
     for name, found in arrays.items():
         if environment[name] != found:
             return f"its environment's {name} is {environment[name]}, that of its arrays {found}"
@@ -218,7 +230,7 @@ def _plain(value: Any) -> Any:
 def pack_episode(episode: Episode, about: dict[str, Any]) -> bytes:
     """Return the content of the file. The same episode results in the same bytes."""
     content = io.BytesIO()
-    arrays = {name: np.ascontiguousarray(getattr(episode, name)) for name in _ARRAYS}  # column-major cannot be mapped
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays_of(episode).items()}  # to be mapped
     np.savez(content, allow_pickle=False, **arrays, meta=np.array(json.dumps(about)))
     return content.getvalue()
 
@@ -244,7 +256,7 @@ class EpisodeFile(NamedTuple):
 
     stamp: Stamp
     arrays: tuple[StoredArray, ...]
-    """Those of observation, action and reward."""
+    """Those of observation (of several parts by name), action and reward."""
 
     def read(self, file: io.FileIO, start: int, into: Sequence[NDArray[Any]]) -> bool:
         """Read the steps from `start` on into contiguous arrays of the same length, one for each of ours.
@@ -294,20 +306,29 @@ def _open_episode(path: Path, record: EpisodeRecord, verified: Stamp | None) -> 
             raise ValueError(f"it has {len(mapped)} bytes, expected {record.size}")
         if stamp != verified and hashlib.sha256(mapped).hexdigest() != record.sha256:
             raise ValueError("its sha256 is not that of the index")
+        names = _members(record.environment)
         with zipfile.ZipFile(path) as archive:
-            arrays = tuple(_locate(mapped, archive.getinfo(f"{name}.npy")) for name in _ARRAYS)
-        observation, action, reward = (array.view(mapped) for array in arrays)
+            arrays = tuple(_locate(mapped, archive.getinfo(f"{name}.npy")) for name in names)
+        *observed, action, reward = (array.view(mapped) for array in arrays)
     except FileNotFoundError as error:
         raise DamagedEpisodeError(path, "it is missing") from error
     except (KeyError, ValueError, struct.error, zipfile.BadZipFile) as error:
         raise DamagedEpisodeError(path, str(error.args[0])) from error
-    episode = Episode(observation, action, reward, record.terminated, record.frames)
+    parts = {name.partition("/")[2]: array for name, array in zip(names, observed, strict=False)}
+    episode = Episode(parts.get("", parts), action, reward, record.terminated, record.frames)
     problem = (stamp != verified and problem_of(episode)) or _problem_with_shapes(record.environment, episode)
     if not problem and len(reward) != record.steps + 1:
         problem = f"it has {len(reward) - 1} steps, expected {record.steps}"
     if problem:
         raise DamagedEpisodeError(path, problem)
     return EpisodeFile(stamp, arrays), episode
+
+
+def _members(environment: dict[str, Any]) -> list[str]:
+    """Return the names of the arrays in a file, those of the observation first."""
+    shape = environment["observation_shape"]
+    parts = [f"observation/{name}" for name in sorted(shape)] if isinstance(shape, dict) else ["observation"]
+    return [*parts, "action", "reward"]
 
 
 def read_record(path: Path) -> EpisodeRecord:

@@ -18,6 +18,7 @@ from forbes.distributed import gathered, num_ranks, rank
 from forbes.envs import TIME_LIMIT, EnvironmentProcess, find_environment
 from forbes.errors import ForbesError
 from forbes.factors import Discrete, as_discrete
+from forbes.shapes import Shape, shape_of
 
 __all__ = ["Experience"]
 
@@ -78,9 +79,9 @@ class Experience(SequenceSource):
         return EpisodeWorker(self._make, self.timeout, self.time_limit)
 
     @property
-    def observation_shape(self) -> tuple[int, ...]:  # type: ignore[override]
+    def observation_shape(self) -> Shape:  # type: ignore[override]
         """Shape of one observation, without batch and time."""
-        return tuple(self._known_shapes()["observation_shape"])
+        return shape_of(self._known_shapes()["observation_shape"])
 
     @property
     def action_dim(self) -> int:  # type: ignore[override]

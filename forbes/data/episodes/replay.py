@@ -16,7 +16,7 @@ from forbes.errors import ForbesError, require_at_least
 from forbes.factors import Discrete, as_discrete
 from forbes.rounding import ceil_div
 from forbes.seeding import generator
-from forbes.shapes import printed_by_shape
+from forbes.shapes import Observed, Shape, map_parts, printed_by_shape, shape_of
 
 __all__ = ["Replay", "Segments"]
 
@@ -25,8 +25,8 @@ __all__ = ["Replay", "Segments"]
 class Segments(NamedTuple):
     """Segments of episodes as they are stored."""
 
-    observation: Tensor
-    """o_t, uint8 (B, T, C, H, W) or float32 (B, T, O); 0 on padding."""
+    observation: Observed
+    """o_t, uint8 (B, T, C, H, W) or float32 (B, T, O), or a dict of them by part; 0 on padding."""
     action: Tensor
     """a_{t-1}, float32 (B, T, A)."""
     reward: Tensor
@@ -37,11 +37,14 @@ class Segments(NamedTuple):
     """True on the last step of an episode that terminated, bool (B, T)."""
 
     @classmethod
-    def unwritten(cls, count: int, length: int, observation_shape: tuple[int, ...], action_dim: int) -> "Segments":
+    def unwritten(cls, count: int, length: int, observation_shape: Shape, action_dim: int) -> "Segments":
         """Return segments to be written to: their values are arbitrary, their masks False."""
-        dtype = torch.uint8 if len(observation_shape) == 3 else torch.float32
+
+        def observations(shape: tuple[int, ...]) -> Tensor:
+            return torch.empty(count, length, *shape, dtype=torch.uint8 if len(shape) == 3 else torch.float32)
+
         return cls(
-            observation=torch.empty(count, length, *observation_shape, dtype=dtype),
+            observation=map_parts(observations, observation_shape),
             action=torch.empty(count, length, action_dim),
             reward=torch.empty(count, length),
             mask=torch.zeros(count, length, dtype=torch.bool),
@@ -57,9 +60,11 @@ class Segments(NamedTuple):
             ends: whether the episode terminates with the last one.
 
         Returns:
-            Observation, action and reward of the steps, as arrays to write to.
+            Observation, action and reward of the steps, as arrays to write to; several parts by name.
         """
-        stored = (self.observation, self.action, self.reward)
+        parts = self.observation
+        observed = [parts[name] for name in sorted(parts)] if isinstance(parts, dict) else [parts]
+        stored = (*observed, self.action, self.reward)
         for values in stored:
             values[row, steps:] = 0
         self.mask[row, :steps] = True
@@ -119,7 +124,7 @@ class Replay(SequenceSource):
         self._watermark = self.store.watermark
         self._verified: set[Split] = set()
         environment = next(iter(self.store.records.values())).environment
-        self.observation_shape: tuple[int, ...] = tuple(environment["observation_shape"])
+        self.observation_shape = shape_of(environment["observation_shape"])
         self.action_dim: int = environment["action_dim"]
         self.discrete: Discrete = as_discrete(environment["discrete"])
 

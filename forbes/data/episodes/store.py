@@ -153,7 +153,7 @@ class EpisodeStore:
         Args:
             number: number of the episode.
             start: the first step.
-            into: contiguous arrays for observation, action and reward, as long as the number of steps.
+            into: contiguous arrays for observation (its parts by name), action and reward, as long as the steps.
 
         Raises:
             DamagedEpisodeError: if the file does not match the index.

@@ -4,7 +4,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from forbes.data.episodes.episode import Episode, EpisodeRecord
+import numpy as np
+
+from forbes.data.episodes.episode import Episode, EpisodeRecord, arrays_of
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.data.imports.source import Source
 from forbes.errors import ForbesError
@@ -68,7 +70,5 @@ def _holds(store: EpisodeStore, number: int, source: Source) -> bool:
 
 
 def _equal(one: Episode, other: Episode) -> bool:
-    return all(
-        ours.shape == theirs.shape and bool((ours == theirs).all())
-        for ours, theirs in zip(one[:3], other[:3], strict=True)
-    )
+    ours, theirs = arrays_of(one), arrays_of(other)
+    return ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)

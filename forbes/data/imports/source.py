@@ -14,6 +14,7 @@ from forbes.envs.images import to_image
 from forbes.errors import ForbesError
 from forbes.factors import are_one_hot, as_plain, described_sizes, discrete_of, to_one_hot
 from forbes.reading import readable
+from forbes.shapes import Observed, Shape, map_parts, plain_shape
 
 __all__ = ["REMEDY", "SAMPLE", "Source"]
 
@@ -26,8 +27,8 @@ _MOST = 10_000  # numbers of a discrete action, A; larger integers are something
 class _Steps(NamedTuple):
     """An episode in numbers, before it is shifted."""
 
-    observation: NDArray[Any]
-    """Every k-th one, uint8 `(n, C, H, W)` or float32 `(n, O)`."""
+    observation: Observed
+    """Every k-th one, uint8 `(n, C, H, W)` or float32 `(n, O)`, or these by part."""
     observed: int
     """Number of observations, N."""
     action: NDArray[Any]
@@ -49,8 +50,9 @@ class Source:
     Args:
         reader: the recorded episodes.
         path: file or folder, for messages and as the name of the task.
-        image: key of the observation, if it is an image.
-        proprio: keys of the observation, if it is a vector; several are concatenated.
+        images: keys of images of the observation.
+        proprio: keys of vectors of the observation, which are concatenated. With images, or of several images, the
+            observation has parts.
         action: key of the action. Integers become one-hot vectors, one each.
         reward: key of the reward. Without one, rewards are 0.
         resize: side of the images in pixels.
@@ -66,7 +68,7 @@ class Source:
         self,
         reader: Reader,
         path: Path,
-        image: str | None = None,
+        images: Sequence[str] = (),
         proprio: Sequence[str] = (),
         action: str | None = None,
         reward: str | None = None,
@@ -80,7 +82,7 @@ class Source:
             raise ForbesError(f"{path}: there are no episodes. Name another file or folder")
         with readable(path, reader.name, REMEDY):
             self.fields = reader.fields()
-        self.keys = choose_keys(str(path), reader, self.fields, image, proprio, action, reward)
+        self.keys = choose_keys(str(path), reader, self.fields, images, proprio, action, reward)
         self.every = self._every(fps)
         self.sizes, self.counted = self._kind_of_actions(tuple(action_sizes) or reader.action_sizes)
         self.discrete = discrete_of(self.sizes)
@@ -95,7 +97,7 @@ class Source:
         """Return the environment for the record of an episode: the name of the source, shapes, and the conversion."""
         return {
             "task": self.path.resolve().name,
-            "observation_shape": list(self.first.observation.shape[1:]),
+            "observation_shape": plain_shape(_shape(self.first.observation)),
             "action_dim": self.first.action.shape[1],
             "discrete": as_plain(self.discrete),
             "action_repeat": self.every,
@@ -112,7 +114,7 @@ class Source:
         episode = self._align(recorded, steps)
         problem, first = problem_of(episode), getattr(self, "first", episode)
         for name in ("observation", "action"):
-            found, expected = (getattr(each, name).shape[1:] for each in (episode, first))
+            found, expected = (_shape(getattr(each, name)) for each in (episode, first))
             if not problem and found != expected:
                 problem = f"its {name} has shape {found}, expected that of the first episode, {expected}"
         if not problem and self.sizes and not are_one_hot(episode.action[1:], self.sizes):
@@ -130,16 +132,24 @@ class Source:
             if self.keys.reward is not None:
                 reward = _float32(_numbers(recorded, self.keys.reward))
                 reward = reward.reshape(len(reward), -1).sum(1)  # (N,)
-            if self.keys.image is not None:
-                observation, count = self._images(recorded, recorded.values[self.keys.image])  # (n, C, H, W)
-            else:
-                parts = [_float32(_numbers(recorded, key)) for key in self.keys.proprio]
-                count = len(parts[0])
-                if len(lengths := {len(part) for part in parts}) > 1:
-                    raise ForbesError(f"{recorded.where}: unequal lengths of {self.keys.proprio}: {lengths}. {REMEDY}")
-                observation = np.concatenate([part.reshape(count, -1) for part in parts], axis=1)  # (N, O)
-                observation = observation[:: self.every]  # (n, O)
-        return recorded, _Steps(observation, count, action, reward)
+            parts = {name: self._part(recorded, keys) for name, keys in self.keys.parts().items()}
+            lengths = {name: count for name, (_, count) in parts.items()}
+            if len({*lengths.values()}) > 1:
+                raise ForbesError(f"{recorded.where}: unequal lengths: {lengths}. {REMEDY}")
+        observed = {name: values for name, (values, _) in parts.items()}
+        observation = observed if len(observed) > 1 else next(iter(observed.values()))
+        return recorded, _Steps(observation, next(iter(lengths.values())), action, reward)
+
+    def _part(self, recorded: Recorded, keys: Sequence[str]) -> tuple[NDArray[Any], int]:
+        """Return every k-th image or vector of a part, and the number of all."""
+        if keys[0] in self.keys.images:
+            return self._images(recorded, recorded.values[keys[0]])  # (n, C, H, W)
+        vectors = [_float32(_numbers(recorded, key)) for key in keys]
+        count = len(vectors[0])
+        if len(lengths := {len(vector) for vector in vectors}) > 1:
+            raise ForbesError(f"{recorded.where}: unequal lengths of {self.keys.proprio}: {lengths}. {REMEDY}")
+        joined = np.concatenate([vector.reshape(count, -1) for vector in vectors], axis=1)  # (N, O)
+        return joined[:: self.every], count  # (n, O)
 
     def _read(self, number: int, keys: list[str]) -> Recorded:
         recorded = self.reader.read(number, keys)
@@ -257,6 +267,11 @@ class Source:
         if every < 1 or abs(self.reader.fps / fps - every) > 0.01 * every:
             raise ForbesError(f"{self.path}: --fps {fps:g} does not divide the {self.reader.fps:g} steps per second")
         return every
+
+
+def _shape(values: Observed) -> Shape:
+    shape: Shape = map_parts(lambda array: array.shape[1:], values)
+    return shape
 
 
 def _numbers(recorded: Recorded, key: str) -> NDArray[Any]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from forbes.data.episodes.episode import Episode
 from forbes.data.imports.source import SAMPLE, Source
 from forbes.factors import described_sizes
+from forbes.shapes import Observed
 
 __all__ = ["Survey", "survey"]
 
@@ -32,21 +33,25 @@ def survey(source: Source) -> Survey:
         (key, *used.get(key, ("not used", ""))[:1], str(shape), str(dtype), used.get(key, ("", ""))[1])
         for key, (shape, dtype) in source.fields.items()
     ]
-    order = ["observation", "action", "reward", "not used"]
-    return Survey(sorted(rows, key=lambda row: order.index(row[1])), _facts(source, sample))
+    order = ["observation", "action", "reward", "not"]
+    return Survey(sorted(rows, key=lambda row: order.index(row[1].partition(" ")[0])), _facts(source, sample))
 
 
 def _used(source: Source, sample: Sequence[Episode]) -> dict[str, tuple[str, str]]:
     """Return what each used key becomes, and its range."""
-    keys, start = source.keys, 0
+    keys = source.keys
     used = {keys.action: ("action", _range([episode.action[1:] for episode in sample]))}
     if keys.reward is not None:
         used[keys.reward] = "reward", _range([episode.reward[1:] for episode in sample])
-    for key in keys.observation:
-        size = int(np.prod(source.fields[key].shape, dtype=int))
-        part = slice(None) if keys.image is not None else slice(start, start + size)
-        used[key] = "observation", _range([episode.observation[:, part] for episode in sample])
-        start += size
+    parts = keys.parts()
+    for part, of_part in parts.items():
+        arrays = [episode.observation[part] if len(parts) > 1 else episode.observation for episode in sample]
+        start, becomes = 0, f"observation {part}" if len(parts) > 1 else "observation"
+        for key in of_part:
+            size = int(np.prod(source.fields[key].shape, dtype=int))
+            columns = slice(None) if key in keys.images else slice(start, start + size)
+            used[key] = becomes, _range([array[:, columns] for array in arrays])
+            start += size
     return used
 
 
@@ -58,7 +63,7 @@ def _facts(source: Source, sample: Sequence[Episode]) -> dict[str, str]:
     facts = {
         "format": reader.name,
         "episodes": f"{len(source)}, of {min(lengths)} to {max(lengths)} steps, {ended} terminated{of_sample}",
-        "observation": f"{first.observation.dtype} {first.observation.shape[1:]}",
+        "observation": _arrays(first.observation),
         "action": f"float32 {first.action.shape[1:]}, {_kind(source, sample)}",
         "alignment": _alignment(source),
     }
@@ -71,6 +76,13 @@ def _facts(source: Source, sample: Sequence[Episode]) -> dict[str, str]:
     if reader.note:
         facts["note"] = reader.note
     return facts
+
+
+def _arrays(observation: Observed) -> str:
+    """Return dtype and shape of an observation, or of each part."""
+    if isinstance(observation, dict):
+        return ", ".join(f"{name} {_arrays(observation[name])}" for name in sorted(observation))
+    return f"{observation.dtype} {observation.shape[1:]}"
 
 
 def _alignment(source: Source) -> str:

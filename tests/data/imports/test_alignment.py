@@ -40,7 +40,7 @@ def test_a_picture_is_that_of_the_action_that_led_to_it(name, tmp_path):
     recorded = recordings.episodes(images=name != "lerobot")
     path = recordings.write(name, tmp_path / "recorded", recorded)
     keys = {"lerobot": "observation.images.top", "lance": "pixels"}
-    found = source(path, name, image=keys.get(name, "image"), resize=16)
+    found = source(path, name, images=[keys.get(name, "image")], resize=16)
 
     for number, theirs in enumerate(recorded):
         ours = found.episode(number)

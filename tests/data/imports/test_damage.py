@@ -136,7 +136,7 @@ def test_images_of_floats_are_refused(tmp_path):
         with np.load(file) as arrays:
             rewrite(file, image=arrays["image"] / 255)
 
-    assert "--image image is float64 (32, 32, 3), expected uint8" in sentence_of(path, tmp_path / "s", image="image")
+    assert "--image image is float64 (32, 32, 3), expected uint8" in sentence_of(path, tmp_path / "s", images=["image"])
     assert "no key has an image (uint8) or a vector" in sentence_of(path, tmp_path / "s")
 
 
@@ -243,7 +243,7 @@ def test_a_video_with_too_few_frames_is_refused(tmp_path):
     frames = recordings.pictures(np.zeros((9, 1))).transpose(0, 2, 3, 1)
     recordings.film(path / "videos/observation.images.top/chunk-000/file-000.mp4", frames)
 
-    message = sentence_of(path, tmp_path / "store", image="observation.images.top")
+    message = sentence_of(path, tmp_path / "store", images=["observation.images.top"])
 
     assert "has 4 frames from 0.5 s on, expected 6" in message
 

@@ -269,7 +269,7 @@ def test_parts_of_a_minari_data_set_are_chosen_by_key(tmp_path, monkeypatch):
     vector = source(tmp_path / "lab/toy-v0", proprio=["robot/place", "robot/gripper"]).episode(0)
     np.testing.assert_array_equal(vector.observation, [[0, 1, 0], [2, 3, 1], [4, 5, 2], [6, 7, 3]])
     np.testing.assert_array_equal(vector.action[1:], np.eye(4)[[0, 2, 1]])
-    by_id = Source(open_reader(Path("lab/toy-v0"), "minari"), Path("lab/toy-v0"), image="camera")
+    by_id = Source(open_reader(Path("lab/toy-v0"), "minari"), Path("lab/toy-v0"), images=["camera"])
     np.testing.assert_array_equal(by_id.episode(0).observation, image.transpose(0, 3, 1, 2))
     assert by_id.describe()["task"] == "toy-v0"
 
