@@ -1,7 +1,7 @@
 """Stop a training before the first update that is not finite."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -96,7 +96,7 @@ class StopAtDivergence(Callback):
 
 
 def _failure_record(
-    trainer: Trainer, module: LightningModule, update: int, before: Mapping[str, Tensor]
+    trainer: Trainer, module: LightningModule, update: int, before: dict[str, Tensor]
 ) -> dict[str, Any]:
     """Return plain values and tensors from which the update can be recomputed, with the state before it.
 

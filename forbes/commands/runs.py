@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich import box
 from rich.cells import cell_len
@@ -115,7 +115,7 @@ def _table(rows: Sequence[dict[str, str]], widths: dict[str, int]) -> Table:
     """Return the table. What is longer than its column is folded."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, _GAP - 1, 0, 0))
     for name, width in widths.items():
-        justify = "left" if name in ("run", "method", "data", "state") else "right"
+        justify: Literal["left", "right"] = "left" if name in ("run", "method", "data", "state") else "right"
         table.add_column(name, justify=justify, width=width, overflow="fold")
     for row in rows:
         cells = {name: escape(row[name]) for name in widths}
