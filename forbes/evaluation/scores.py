@@ -35,7 +35,7 @@ import torch
 from torch import Tensor
 
 from forbes.data import SequenceBatch
-from forbes.models import BeliefModel, PosteriorModel, has_posterior
+from forbes.models import BeliefModel, PartsLikelihood, PosteriorModel, has_posterior
 from forbes.models.particles import effective_sample_size, run_particles, systematic
 
 __all__ = ["Increments", "LogMeanExp", "Trajectory", "frame_log_prob", "score_open_loop", "score_particles"]
@@ -57,6 +57,8 @@ class Trajectory(NamedTuple):
     """log q(s_t) - log p(s_t), `(B, T)`."""
     prediction: Tensor | None
     """An estimate of log p(o_t | h_t) (`PosteriorModel.one_step_log_prob`), `(B, T)`; None unless it was requested."""
+    parts: dict[str, Tensor]
+    """The reconstruction of each part by its name, `(B, T)`; empty for observations of one array."""
 
 
 class LogMeanExp:
@@ -95,6 +97,15 @@ def frame_log_prob(model: BeliefModel, features: Tensor, target: Tensor) -> Tens
     return torch.cat(parts, -1)  # (*, N)
 
 
+def _by_part(model: BeliefModel, features: Tensor, target: Tensor) -> dict[str, Tensor]:
+    """Return log p of each part of frames `(N, *O)` as `frame_log_prob`, of features `(N, F)`: `(N,)` by name."""
+    if not isinstance(model.likelihood, PartsLikelihood):
+        return {}
+    chunks = zip(features.split(_FRAMES), target.split(_FRAMES), strict=True)
+    found = [model.log_likelihood_by_part(chunk, frames)[1] for chunk, frames in chunks]
+    return {name: torch.cat([each[name] for each in found]).double() for name in model.likelihood.parts}
+
+
 def trajectories(model: PosteriorModel, batch: SequenceBatch, number: int, predict: bool) -> Iterator[Trajectory]:
     """Sample trajectories one at a time, so that only one is in memory. The encoder runs once.
 
@@ -116,21 +127,28 @@ def trajectories(model: PosteriorModel, batch: SequenceBatch, number: int, predi
         kl = filtered.log_prob - model.prior_log_prob(filtered)
         reconstruction = log_prob(filtered.features)
         prediction = model.one_step_log_prob(filtered, reconstruction, log_prob) if predict else None
-        yield Trajectory(reconstruction, kl.double(), prediction)
+        by_part = _by_part(model, filtered.features.flatten(0, 1), target)  # (B T,) by name
+        parts = {name: values.view(batch.mask.shape) for name, values in by_part.items()}  # (B, T)
+        yield Trajectory(reconstruction, kl.double(), prediction, parts)
 
 
 @torch.no_grad()
 def score_trajectories(model: PosteriorModel, batch: SequenceBatch, number: int, predict: bool) -> Increments:
     """Score a batch with K trajectories: `elbo`, `reconstruction`, `kl`, `iwae`, and `pll` if `predict` is set.
 
+    The reconstruction of each of several parts is `reconstruction/NAME`.
+
     `iwae` at step t is the bound of the first t steps minus that of the first t - 1, so it sums to the whole bound.
     """
     mask = batch.mask.double()
     reconstruction, kl = torch.zeros_like(mask), torch.zeros_like(mask)
+    by_part: dict[str, Tensor] = {}
     weight, prediction = LogMeanExp(), LogMeanExp()
     for trajectory in trajectories(model, batch, number, predict):
         reconstruction += trajectory.reconstruction / number
         kl += trajectory.kl / number
+        for name, values in trajectory.parts.items():
+            by_part[name] = by_part.get(name, torch.zeros_like(mask)) + values / number
         weight.add(((trajectory.reconstruction - trajectory.kl) * mask).cumsum(1))
         if trajectory.prediction is not None:
             prediction.add(trajectory.prediction)
@@ -139,6 +157,7 @@ def score_trajectories(model: PosteriorModel, batch: SequenceBatch, number: int,
         "reconstruction": reconstruction,
         "kl": kl,
         "iwae": weight.result().diff(dim=1, prepend=torch.zeros_like(mask[:, :1])),
+        **{f"reconstruction/{name}": values for name, values in by_part.items()},
     }
     if predict:
         scores["pll"] = prediction.result()

@@ -26,7 +26,7 @@ from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import split_batches
 from forbes.evaluation.scores import Increments, score_open_loop, score_particles, score_predictions, score_trajectories
 from forbes.files import replace_file
-from forbes.models import BeliefModel
+from forbes.models import BeliefModel, PartsLikelihood
 from forbes.pomdps import Process
 from forbes.reading import read_npz
 from forbes.seeding import derive_seed, forked
@@ -59,8 +59,11 @@ class Scorer(NamedTuple):
     """Number of leading steps that the model observes and that are not scored."""
 
     def of(self, model: BeliefModel) -> "Scorer":
-        """Drop what a model lacks, e.g. the bounds if it has no posterior with a density."""
-        return self._replace(metrics=tuple(metric for metric in self.metrics if metric not in model.lacks))
+        """Drop what a model lacks, e.g. the bounds if it has no posterior with a density; add what it has by part."""
+        metrics = [metric for metric in self.metrics if metric not in model.lacks]
+        if "reconstruction" in metrics and isinstance(model.likelihood, PartsLikelihood):
+            metrics += [f"reconstruction/{name}" for name in model.likelihood.parts]
+        return self._replace(metrics=tuple(metrics))
 
 
 class Scores(NamedTuple):

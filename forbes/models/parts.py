@@ -91,11 +91,9 @@ class PartsLikelihood(Likelihood):
         return sum_of_parts(self.log_prob_by_part(output, target))
 
     def log_prob_by_part(self, output: Tensor, target: Tensor) -> dict[str, Tensor]:
-        """See `Likelihood.log_prob_by_part`; a part is named with its density, e.g. `camera[normal(1)]`."""
+        """See `Likelihood.log_prob_by_part`."""
         outputs, targets = self.split(output), self.split(target)
-        return {
-            f"{name}[{part.name}]": part.log_prob(outputs[name], targets[name]) for name, part in self.parts.items()
-        }
+        return {name: part.log_prob(outputs[name], targets[name]) for name, part in self.parts.items()}
 
     def images(self, values: Tensor) -> Tensor:
         """See `Likelihood.images`: the parts that are images, side by side; vectors are left out."""
