@@ -171,6 +171,7 @@ WORLDS = {
     "vector": (["--model.model", "VectorModel", "--model.state_dim", "0"], ["pll", "open-loop"]),
 }
 RARE = {"divergence/update", "divergence/RATE", "reward_uncertainty[episodes=N]"}
+RARE |= {"SPLIT/reconstruction/PART", "SPLIT/reconstruction/PART[LIKELIHOOD,S=N]"}  # see commands/test_parts.py
 """Metrics that the small runs above do not record."""
 PROCESS = ["--trainer.max_epochs", "1", "--data.updates_per_epoch", "2", "--data.validation_sequences", "4"]
 

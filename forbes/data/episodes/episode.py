@@ -12,18 +12,19 @@ import mmap
 import os
 import struct
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from forbes.data.episodes.fields import FITS, problem_of_environment
 from forbes.envs import TIME_LIMIT
 from forbes.errors import ForbesError
-from forbes.factors import as_discrete, problem_of_choices, problem_of_discrete
-from forbes.reading import is_number, readable, shortened
-from forbes.shapes import NAMES, Observed, is_names, is_shape, map_parts, printed_by_shape
+from forbes.factors import as_discrete, problem_of_choices
+from forbes.reading import readable, shortened
+from forbes.shapes import NAMES, Observed, is_names, map_parts, printed_by_shape
 
 __all__ = ["DamagedEpisodeError", "Episode", "EpisodeFile", "EpisodeRecord", "Stamp", "locate_episode", "map_episode"]
 __all__ += ["arrays_of", "describe_episode", "pack_episode", "problem_of", "problem_with", "read_record", "stamp_of"]
@@ -70,26 +71,6 @@ class Episode(NamedTuple):
         return float(self.reward.sum(dtype="float64"))
 
 
-_FITS: dict[Any, Callable[[Any], bool]] = {
-    int: lambda value: type(value) is int and 0 <= value < 2**63,
-    float: lambda value: is_number(value) and -math.inf < value < math.inf,
-    bool: lambda value: type(value) is bool,
-    str: lambda value: type(value) is str,
-    dict[str, Any]: lambda value: type(value) is dict,
-}
-_ENVIRONMENT: dict[str, Callable[[Any], bool]] = {
-    "task": _FITS[str],
-    "observation_shape": lambda value: type(value) in (list, dict) and is_shape(value),
-    "action_dim": lambda value: _is_size(value),
-    "discrete": lambda value: type(value) is bool or (type(value) is list and all(map(_is_size, value))),
-}
-"""Required fields of a record's environment, with a check of their values."""
-
-
-def _is_size(value: Any) -> bool:
-    return _FITS[int](value) and value > 0
-
-
 class EpisodeRecord(NamedTuple):
     """The entry of an episode in the index, a line of `index.jsonl`."""
 
@@ -115,7 +96,7 @@ class EpisodeRecord(NamedTuple):
     def problem(self) -> str:
         """Return what is wrong with the values, as in a damaged index, or an empty string."""
         for name, kind in type(self).__annotations__.items():
-            if not _FITS[kind](value := getattr(self, name)):
+            if not FITS[kind](value := getattr(self, name)):
                 return f"its {name} is {shortened(str(value), _SHOWN)}"
         return "it has no step" if self.steps == 0 else problem_of_environment(self.environment)
 
@@ -164,18 +145,6 @@ def problem_of(episode: Episode) -> str:
     if episode.action[0].any() or episode.reward[0] != 0:
         return "its first action or reward is not zero, expected index t to have the action that led to o_t"
     return ""
-
-
-def problem_of_environment(environment: dict[str, Any]) -> str:
-    """Return what is wrong with the environment of a record, or an empty string."""
-    for name, fits in _ENVIRONMENT.items():
-        if name not in environment:
-            return f"its environment has no {name}, expected the result of `describe_environment`"
-        if not fits(value := environment[name]):
-            return f"its environment's {name} is {shortened(str(value), _SHOWN)}"
-    if problem := problem_of_discrete(as_discrete(environment["discrete"]), environment["action_dim"]):
-        return f"its environment's {problem}"
-    return "" if type(environment.get("made_by", {})) is dict else "its environment's made_by is not a mapping"
 
 
 def problem_with(environment: dict[str, Any], episode: Episode) -> str:
