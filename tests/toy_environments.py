@@ -194,6 +194,19 @@ class Screen(Pictures):
         return {"task": "Screen"}
 
 
+class ScreenWithJoints(Screen):
+    """The same with proprioception."""
+
+    def __init__(self, proprio=True, size=64, fast=False, action_repeat=2):
+        super().__init__(size)
+        self.size, self.observation_shape = self.observation_shape, {"camera": self.observation_shape, "proprio": (4,)}
+
+    def picture(self):
+        frame = np.zeros(self.size, np.uint8)
+        frame[:, 2, self.time] = 255
+        return {"camera": frame, "proprio": np.full(4, self.time, np.float32)}
+
+
 class Slide(Environment):
     """A square that the first action moves to the left or right, on a colour of its own; it is paid for its place."""
 
