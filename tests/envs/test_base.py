@@ -64,7 +64,11 @@ class Sound(Environment):
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("observation_shape", None, "observation_shape is None, expected (C, H, W) or (O,). Set it in the class"),
+        (
+            "observation_shape",
+            None,
+            "observation_shape is None, expected (C, H, W), (O,) or a dict of these by part. Set it in the class",
+        ),
         ("observation_shape", (8, 8), "observation_shape is (8, 8), expected"),
         ("observation_shape", 4, "observation_shape is 4, expected"),
         ("action_dim", 0, "action_dim is 0, expected an integer above 0"),

@@ -264,7 +264,7 @@ def test_parts_of_a_minari_data_set_are_chosen_by_key(tmp_path, monkeypatch):
             "lab/toy-v0", [episode], action_space=spaces.Discrete(4, start=5), observation_space=observations
         )
 
-    with pytest.raises(ForbesError, match="choose --image camera or --proprio robot/gripper or --proprio robot/place"):
+    with pytest.raises(ForbesError, match="Choose some of --image camera --proprio robot/gripper robot/place"):
         source(tmp_path / "lab/toy-v0")
     vector = source(tmp_path / "lab/toy-v0", proprio=["robot/place", "robot/gripper"]).episode(0)
     np.testing.assert_array_equal(vector.observation, [[0, 1, 0], [2, 3, 1], [4, 5, 2], [6, 7, 3]])
