@@ -32,6 +32,26 @@ def run(tmp_path_factory):
     return folder / "run"
 
 
+def fit_whole_and_killed(folder, monkeypatch, config):
+    """Train with room for two episodes: `whole`, and `cut`, which is killed late and resumed."""
+    fit_it = ("--config", config, "--data.source.capacity", 16, "--run_dir")
+
+    def kill(self, loss):
+        if self.global_step == 10:
+            raise Killed
+
+    assert fit(*fit_it, folder / "whole") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(ImaginationActorCritic, "on_before_backward", kill)
+        with pytest.raises(Killed):
+            fit(*fit_it, folder / "cut")
+    assert fit("--resume", folder / "cut") == 0
+
+
+class Killed(BaseException):
+    """What the test kills a training with."""
+
+
 def test_each_epoch_adds_one_episode_to_the_seed_episodes(run):
     records = EpisodeStore(run / "episodes").records.values()
 
@@ -43,18 +63,7 @@ def test_several_episodes_an_epoch_are_kept_for_both_checkpoints(tmp_path, monke
     """Two of the parrot's 8 steps fit, two more are those of the previous checkpoint; a kill changes nothing."""
     config = write_config(tmp_path)
     config.write_text(config.read_text().replace("{seed_episodes: 2", "{episodes: 2, seed_episodes: 2"))
-    fit_it = ("--config", config, "--data.source.capacity", 16, "--run_dir")
-
-    def kill(self, loss):
-        if self.global_step == 10:
-            raise Killed
-
-    assert fit(*fit_it, tmp_path / "whole") == 0
-    with monkeypatch.context() as patch:
-        patch.setattr(ImaginationActorCritic, "on_before_backward", kill)
-        with pytest.raises(Killed):
-            fit(*fit_it, tmp_path / "cut")
-    assert fit("--resume", tmp_path / "cut") == 0
+    fit_whole_and_killed(tmp_path, monkeypatch, config)
 
     metrics = read_metrics(tmp_path / "whole")
     assert metrics["agent_steps"].dropna().tolist() == [16, 32, 48]
@@ -287,18 +296,7 @@ def test_a_disk_that_is_full_ends_the_training_and_loses_nothing(run, tmp_path, 
 
 def test_an_agent_keeps_episodes_up_to_capacity_but_counts_all(run, tmp_path, monkeypatch):
     """Two of the parrot's, of 8 steps, and the two before for both checkpoints; killed late, it goes on the same."""
-    fit_it = ("--config", write_config(tmp_path), "--data.source.capacity", 16, "--run_dir")
-
-    def kill(self, loss):
-        if self.global_step == 10:
-            raise Killed
-
-    assert fit(*fit_it, tmp_path / "whole") == 0
-    with monkeypatch.context() as patch:
-        patch.setattr(ImaginationActorCritic, "on_before_backward", kill)
-        with pytest.raises(Killed):
-            fit(*fit_it, tmp_path / "cut")
-    assert fit("--resume", tmp_path / "cut") == 0
+    fit_whole_and_killed(tmp_path, monkeypatch, write_config(tmp_path))
 
     for folder in (tmp_path / "whole", tmp_path / "cut"):
         kept = sorted(path.name for path in (folder / "episodes").glob("*.npz"))
@@ -306,10 +304,6 @@ def test_an_agent_keeps_episodes_up_to_capacity_but_counts_all(run, tmp_path, mo
     metrics = read_metrics(tmp_path / "whole")
     assert metrics["env_steps"].dropna().tolist() == read_metrics(run)["env_steps"].dropna().tolist()
     pd.testing.assert_frame_equal(read_metrics(tmp_path / "cut"), metrics, check_exact=True)
-
-
-class Killed(BaseException):
-    """What the test kills a training with."""
 
 
 @pytest.mark.parametrize("update", [4, 6, 10])
