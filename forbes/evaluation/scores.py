@@ -35,8 +35,9 @@ import torch
 from torch import Tensor
 
 from forbes.data import SequenceBatch
-from forbes.models import BeliefModel, PartsLikelihood, PosteriorModel, has_posterior
+from forbes.models import BeliefModel, PosteriorModel, has_posterior
 from forbes.models.particles import effective_sample_size, run_particles, systematic
+from forbes.shapes import map_parts
 
 __all__ = ["Increments", "LogMeanExp", "Trajectory", "frame_log_prob", "score_open_loop", "score_particles"]
 __all__ += ["score_predictions", "score_trajectories", "trajectories"]
@@ -89,21 +90,18 @@ def frame_log_prob(model: BeliefModel, features: Tensor, target: Tensor) -> Tens
     Returns:
         `(*, N)`.
     """
+    return _frame_log_prob_by_part(model, features, target)[0]
+
+
+def _frame_log_prob_by_part(model: BeliefModel, features: Tensor, target: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    """See `frame_log_prob`; also that of each part by its name, where an observation has several."""
     size = max(1, _FRAMES // math.prod(features.shape[:-2]))
-    parts = [
-        model.log_likelihood(chunk, frames).double()
+    chunks = [
+        model.log_likelihood_by_part(chunk, frames)
         for chunk, frames in zip(features.split(size, -2), target.split(size), strict=True)
     ]
-    return torch.cat(parts, -1)  # (*, N)
-
-
-def _by_part(model: BeliefModel, features: Tensor, target: Tensor) -> dict[str, Tensor]:
-    """Return log p of each part of frames `(N, *O)` as `frame_log_prob`, of features `(N, F)`: `(N,)` by name."""
-    if not isinstance(model.likelihood, PartsLikelihood):
-        return {}
-    chunks = zip(features.split(_FRAMES), target.split(_FRAMES), strict=True)
-    found = [model.log_likelihood_by_part(chunk, frames)[1] for chunk, frames in chunks]
-    return {name: torch.cat([each[name] for each in found]).double() for name in model.likelihood.parts}
+    whole = torch.cat([total.double() for total, _ in chunks], -1)  # (*, N)
+    return whole, {name: torch.cat([parts[name].double() for _, parts in chunks], -1) for name in chunks[0][1]}
 
 
 def trajectories(model: PosteriorModel, batch: SequenceBatch, number: int, predict: bool) -> Iterator[Trajectory]:
@@ -125,10 +123,11 @@ def trajectories(model: PosteriorModel, batch: SequenceBatch, number: int, predi
     for _ in range(number):
         filtered = model.filter(encoded.embedding, encoded.action)
         kl = filtered.log_prob - model.prior_log_prob(filtered)
-        reconstruction = log_prob(filtered.features)
+        reconstruction, parts = (
+            map_parts(lambda values: values.view(batch.mask.shape), each)  # (B, T)
+            for each in _frame_log_prob_by_part(model, filtered.features.flatten(0, 1), target)
+        )
         prediction = model.one_step_log_prob(filtered, reconstruction, log_prob) if predict else None
-        by_part = _by_part(model, filtered.features.flatten(0, 1), target)  # (B T,) by name
-        parts = {name: values.view(batch.mask.shape) for name, values in by_part.items()}  # (B, T)
         yield Trajectory(reconstruction, kl.double(), prediction, parts)
 
 

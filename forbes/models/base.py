@@ -217,20 +217,15 @@ class BeliefModel(Configurable, nn.Module, ABC):
 
     def log_likelihood(self, features: Tensor, target: Tensor) -> Tensor:
         """Return log p(o | features) in nats: `(*, F)` and `(*, *O)`, which broadcast, to `(*)`."""
-        return self.likelihood.log_prob(self._output(features), target)
+        return self.log_likelihood_by_part(features, target)[0]
 
     def log_likelihood_by_part(self, features: Tensor, target: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return log p(o | features) as `log_likelihood`, and that of each part, where an observation has several."""
-        output = self._output(features)
-        parts = self.likelihood.log_prob_by_part(output, target)
-        if parts:
-            return sum_of_parts(parts), parts
-        return self.likelihood.log_prob(output, target), parts
-
-    def _output(self, features: Tensor) -> Tensor:
-        """Decode, in at least float32: in mixed precision the decoder's output is bfloat16."""
         output = self.decode(features)
-        return output.to(torch.promote_types(output.dtype, torch.float32))
+        output = output.to(torch.promote_types(output.dtype, torch.float32))  # in mixed precision it is bfloat16
+        if parts := self.likelihood.log_prob_by_part(output, target):
+            return sum_of_parts(parts), parts
+        return self.likelihood.log_prob(output, target), {}
 
 
 class RecurrentModel(BeliefModel):

@@ -136,7 +136,7 @@ def test_an_open_loop_follows_the_actions_that_were_taken():
 def test_frame_scores_are_float64_whatever_the_model_uses():
     """A logarithm of a mean over particles cancels: of 1e5 nats float32 loses 0.004."""
     model, batch = make_model(), make_batch()
-    model.log_likelihood = lambda features, target: torch.full(features.shape[:-1], -1e5, dtype=torch.float32)
+    model.log_likelihood_by_part = lambda features, target: (torch.full(features.shape[:-1], -1e5), {})  # float32
 
     found = frame_log_prob(model, torch.zeros(3, STEPS, 7), batch.observation[0])
 
