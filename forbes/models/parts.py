@@ -123,7 +123,7 @@ class PartsEncoder(Encoder):
         >>> parts = {"camera": forbes.ConvEncoder, "proprio": forbes.MLPEncoder.configured(width=16)}
         >>> encoder = forbes.PartsEncoder({"camera": (3, 8, 8), "proprio": (4,)}, parts)
         >>> encoder(torch.zeros(7, 3 * 8 * 8 + 4)).shape
-        torch.Size([7, 80])
+        torch.Size([7, 304])
     """
 
     def __init__(self, observation_shape: Shape, parts: dict[str, EncoderFamily]) -> None:
