@@ -26,7 +26,7 @@ most common ones, with the values of the first example:
   --model.free_nats 0               nats of the KL without cost; --model.kl_warmup 500 updates until its full weight
   --model.learning_rate 6e-3        learning rate; with --model.schedule cosine it decays to 0
   --data.batch_size 50              sequences per batch; --data.length 30 steps per sequence
-  --data.updates_per_epoch 500      updates between validations and checkpoints; --trainer.max_epochs 12 epochs
+  --data.updates_per_epoch 500      updates between validations and checkpoints; --trainer.max_epochs 10 epochs
   --data.source Strokes             source of the sequences; --data.source.task TASK for an agent
   --trainer.accelerator auto        auto, cpu or gpu
   --seed_everything 0               random seed for weights, noise, order of the data and an agent's episodes
