@@ -18,8 +18,9 @@ compare: .venv/installed
 	$(BIN)/forbes figures predictions --runs runs/compare/forbes-0 runs/compare/rssm-0 -o runs/compare/figures
 	$(BIN)/forbes figures elbo --runs runs/compare/forbes-0 runs/compare/rssm-0 -o runs/compare/figures
 
+# A worker per core has a thread, as has each command that a test starts; worksteal leaves most of a file to one worker.
 test: .venv/installed-dev
-	$(BIN)/pytest -q -n auto --maxprocesses 4
+	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto --maxprocesses 4 --dist worksteal
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -4,8 +4,8 @@ No model is loaded, so runs can be drawn while they train, or where their checkp
 """
 
 import re
-from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 from forbes.errors import ForbesError
 from forbes.runs.folder import RunFolder, read_config, read_metrics
@@ -14,7 +14,7 @@ from forbes.runs.naming import class_of, method_of, part_of, task_of, with_suffi
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["LAYERS", "TRAJECTORIES", "RecordedRun", "group_by_method", "read_run", "returns_of"]
+__all__ = ["LAYERS", "TRAJECTORIES", "RecordedRun", "by_configuration", "group_by_method", "read_run", "returns_of"]
 
 TRAJECTORIES, LAYERS = "trajectories", "mlp_layers"
 _SETTINGS = {TRAJECTORIES: "N = {}", LAYERS: "{} layers"}
@@ -58,6 +58,26 @@ def read_run(path: str) -> RecordedRun:
     return RecordedRun(path, method, task_of(config["data"]["init_args"]), settings, config)
 
 
+class _HasConfiguration(Protocol):
+    @property
+    def config(self) -> Mapping[str, Any]: ...
+
+
+Run = TypeVar("Run", bound=_HasConfiguration)
+
+
+def by_configuration(runs: Sequence[Run]) -> list[list[Run]]:
+    """Group runs whose configurations differ only in the seed. Groups and their runs keep the order of the runs."""
+    groups: list[list[Run]] = []
+    for run in runs:
+        same = next((others for others in groups if others[0].config == run.config), None)
+        if same is None:
+            groups.append([run])
+        else:
+            same.append(run)
+    return groups
+
+
 def group_by_method(
     runs: Sequence[RecordedRun], always: Collection[str] = ()
 ) -> dict[str, dict[str, list[RecordedRun]]]:
@@ -70,16 +90,11 @@ def group_by_method(
         runs: runs of any tasks.
         always: settings that are always in the title, e.g. `trajectories`.
     """
-    members: dict[str, list[list[RecordedRun]]] = {}
-    for run in runs:
-        of_task = members.setdefault(run.task, [])
-        same = next((others for others in of_task if others[0].config == run.config), None)
-        if same is None:
-            of_task.append([run])
-        else:
-            same.append(run)
+    of_tasks: dict[str, list[list[RecordedRun]]] = {}
+    for members in by_configuration(runs):
+        of_tasks.setdefault(members[0].task, []).append(members)
     grouped: dict[str, dict[str, list[RecordedRun]]] = {}
-    for task, of_task in members.items():
+    for task, of_task in of_tasks.items():
         grouped[task] = dict(zip(_titles([of_one[0] for of_one in of_task], runs, always), of_task, strict=True))
     return grouped
 

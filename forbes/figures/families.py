@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from forbes.errors import ForbesError
+from forbes.evaluation.methods import by_configuration
 from forbes.evaluation.record import read_record
 from forbes.evaluation.runs import TrainedRun, data_sha256, require_comparable, run_titles
 from forbes.figures.style import Method, method_styles
@@ -47,13 +48,7 @@ class RunFamily(NamedTuple):
 
 def group(runs: Sequence[TrainedRun]) -> list[RunFamily]:
     """Group runs into families, whose configurations differ only in the seed."""
-    members: list[list[TrainedRun]] = []
-    for run in runs:
-        same = next((others for others in members if others[0].config == run.config), None)
-        if same is None:
-            members.append([run])
-        else:
-            same.append(run)
+    members = by_configuration(runs)
     titles = run_titles([first for first, *_ in members])
     styles = method_styles(titles)
     return [RunFamily(title, styles[title], of_one) for title, of_one in zip(titles, members, strict=True)]
