@@ -14,7 +14,6 @@ from forbes.data.episodes.store import EpisodeStore, first_held
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError, require_at_least
 from forbes.factors import Discrete, as_discrete
-from forbes.rounding import ceil_div
 from forbes.seeding import generator
 from forbes.shapes import Observed, Shape, map_parts, printed_by_shape, shape_of
 
@@ -91,8 +90,8 @@ class Replay(SequenceSource):
 
     so no segment crosses episodes, and the last of the :math:`n_e` observations of an episode is sampled as often as
     the first. Batch i is a pure function of (seed, i, the episodes held). Held-out segments start at every `stride`-th
-    observation. A segment is padded if its episode is too short. If it starts within an episode, its first action is
-    the one that led there.
+    observation; a rest of fewer than `stride` begins none, unless it is a whole episode. A segment is padded if its
+    episode is too short. If it starts within an episode, its first action is the one that led there.
 
     Of ten episodes, the ninth is in the validation split and the tenth in the test split (number mod `hold_out`).
 
@@ -163,7 +162,7 @@ class Replay(SequenceSource):
 
     def _table(self, numbers: list[int], stride: int) -> _Table:
         lengths = torch.tensor([self.store.records[number].steps + 1 for number in numbers], dtype=torch.int64)
-        return _Table(numbers, lengths, ceil_div(lengths, stride).cumsum(0))  # (E,), (E,)
+        return _Table(numbers, lengths, _num_segments(lengths, stride).cumsum(0))  # (E,), (E,)
 
     def _stride(self, split: Split) -> int:
         return 1 if split == "train" else self.stride
@@ -179,7 +178,7 @@ class Replay(SequenceSource):
         return hashlib.sha256(" ".join(record.sha256 for record in self._held()).encode()).hexdigest()
 
     def size(self, split: Split) -> int:
-        """Return the number of segments: one per observation in training, else one per `stride` observations."""
+        """Return the number of segments: one per observation in training, else one per `stride` of an episode."""
         ends = self._tables[split].ends
         return int(ends[-1]) if len(ends) else 0
 
@@ -215,7 +214,7 @@ class Replay(SequenceSource):
         """Yield the number of the episode and the start of each segment."""
         table, stride = self._require(split), self._stride(split)
         row = torch.searchsorted(table.ends, index, right=True)  # (B,)
-        before = table.ends - ceil_div(table.lengths, stride)  # (E,), segments of earlier episodes
+        before = table.ends - _num_segments(table.lengths, stride)  # (E,), segments of earlier episodes
         start = stride * (index - before[row])  # (B,)
         return zip((table.numbers[episode] for episode in row.tolist()), start.tolist(), strict=True)
 
@@ -233,3 +232,8 @@ class Replay(SequenceSource):
                 "or choose a smaller hold_out"
             )
         return table
+
+
+def _num_segments(lengths: Tensor, stride: int) -> Tensor:
+    """Return the number of segments of each episode, `(E,)` to `(E,)`."""
+    return (lengths // stride).clamp(min=1)

@@ -169,18 +169,19 @@ def test_each_held_out_split_keeps_its_tenth_of_the_episodes(tmp_path):
     assert set(drawn(source, 40, 50, 3).observation[..., 0].unique().tolist()) == set(range(24)) - {8, 9, 18, 19}
 
 
-def test_held_out_windows_tile_their_episodes(tmp_path):
+def test_held_out_windows_tile_their_episodes_without_rests(tmp_path):
+    """A window of one step would be a sequence that no score is about, and that none of a context can score."""
     path = str(tmp_path / "store")
-    add(path, [5, 5, 23, 5, 5, 11])
+    add(path, [5, 5, 23, 5, 5, 11, 5, 5, 6])
     data = SequenceDataModule(Replay(path, hold_out=3, stride=10), batch_size=2, length=10)
 
     batches = [data.on_after_batch_transfer(compact, 0) for compact in data.test_dataloader()]
     number, time = (torch.cat([batch.observation[..., k] for batch in batches]) for k in (0, 1))
     mask = torch.cat([batch.mask for batch in batches])
 
-    assert number[:, 0].tolist() == [2, 2, 2, 5, 5]
-    assert time[:, 0].tolist() == [0, 10, 20, 0, 10]
-    assert mask.sum(1).tolist() == [10, 10, 3, 10, 1]
+    assert number[:, 0].tolist() == [2, 2, 5, 8]
+    assert time[:, 0].tolist() == [0, 10, 0, 0]
+    assert mask.sum(1).tolist() == [10, 10, 10, 6]
     assert sum(len(batch.mask) for batch in batches) == data.source.size("test")
 
 
