@@ -29,7 +29,7 @@ from forbes.seeding import forked
 __all__ = ["lowest_above", "reference_means", "references"]
 
 _EXAMPLES, _ROWS = 500, 50
-"""Number of training sequences that are averaged and fitted, and number of sequences decoded at a time."""
+"""Number of training sequences that are averaged and fitted, at equal distances, and that are decoded at a time."""
 _Gaussian = Normal | VectorNormal | SymlogNormal
 _NAMES = {3: ("mean frame", "last frame"), 1: ("mean observation", "last observation")}
 """Names of the constant predictions by rank of the observation."""
@@ -85,7 +85,9 @@ def _predictions(data: SequenceData, likelihood: Likelihood, split: Split, count
 
 
 def _train(data: SequenceData) -> Iterator[SequenceBatch]:
-    for index in torch.arange(min(_EXAMPLES, data.source.size("train"))).split(_ROWS):
+    size = data.source.size("train")
+    count = min(_EXAMPLES, size)
+    for index in (torch.arange(count) * size // count).split(_ROWS):  # the first ones may all be of one episode
         yield data.sequences("train", index)
 
 

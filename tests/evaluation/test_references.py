@@ -109,6 +109,29 @@ def test_vectors_of_a_linear_process_are_predicted_without_error():
     assert means["mean observation"] < means["last observation"] < means["linear"]
 
 
+class Drift(Motions):
+    """3,000 training sequences of one constant observation each, which grows from 0 to 1, as an agent's data change."""
+
+    def size(self, split):
+        return {"train": 3000, "validation": 0, "test": 2}[split]
+
+    def gather(self, split, index, length):
+        value = index / self.size("train") if split == "train" else torch.full((len(index),), 0.5)
+        return value[:, None, None].expand(-1, length, 2)
+
+    def decode(self, compact):
+        return super().decode(compact)._replace(observation=compact)
+
+
+def test_the_mean_is_of_the_whole_training_split_not_of_its_start():
+    data = SequenceDataModule(Drift(), length=3)
+
+    found = references(data, VectorNormal(), "test", 2)
+
+    best = VectorNormal().log_prob(torch.full((2,), 0.5), torch.full((2,), 0.5)).double()
+    torch.testing.assert_close(found["mean observation"], best.expand(2, 3), rtol=0, atol=1e-5)  # (1 / 1,000)²
+
+
 def test_a_known_process_has_its_own_log_p():
     data = SequenceDataModule(Simulated(LinearGaussian(), train=10, validation=2, test=2), length=5)
 
