@@ -28,17 +28,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def no_module_is_allowed_yet() -> Iterator[None]:
-    """Let a file's tests begin like a process: a record names the modules that were allowed in it, no others."""
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[object]) -> Iterator[None]:
+    """Let what several tests share begin like a process: a record names the modules that were allowed in it alone."""
+    if fixturedef.scope == "function":
+        return (yield)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(configuration, "_allowed", {})
-        yield
+        return (yield)
 
 
 @pytest.fixture(autouse=True)
 def no_module_is_allowed_by_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let each of them begin so."""
+    """Let each test begin so."""
     monkeypatch.setattr(configuration, "_allowed", {})
 
 

@@ -11,6 +11,7 @@ import math
 import mmap
 import os
 import struct
+import threading
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,6 +35,8 @@ _KINDS = {"action": (("<f4", 2),), "reward": (("<f4", 1),)}
 """Possible dtypes and numbers of dimensions of an observation or a part of it, and of the other arrays."""
 _SHOWN = 60  # characters of an invalid value in an error message
 _LOCAL_HEADER = 30  # bytes before the name of a member of a zip archive
+_PARSING = threading.Lock()
+"""Held while numpy parses a header: in Python 3.11 two threads that parse literals may raise a SystemError."""
 
 
 @printed_by_shape
@@ -327,7 +330,8 @@ def _locate(mapped: mmap.mmap, member: zipfile.ZipInfo) -> StoredArray:
     mapped.seek(member.header_offset + _LOCAL_HEADER + name_length + extra_length)
     if np.lib.format.read_magic(mapped) != (1, 0):
         raise ValueError(f"{member.filename} is not of version 1.0 of its format")
-    shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(mapped)
+    with _PARSING:
+        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(mapped)
     if dtype.hasobject or fortran_order:
         raise ValueError(f"{member.filename} has dtype object or column-major order")
     return StoredArray(mapped.tell(), dtype, shape)

@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -351,6 +352,22 @@ def test_a_link_in_place_of_the_list_is_not_followed(store, tmp_path):
     with pytest.raises(ForbesError, match="is a symbolic link"):
         EpisodeStore(store).verify([0])
     assert (tmp_path / "elsewhere").read_text() == ""
+
+
+def test_headers_are_parsed_one_at_a_time(store, monkeypatch):
+    # Garbage collection may run another thread in the midst of Python's parser, and 3.11 then raises a SystemError.
+    parse, parsing, most = np.lib.format.read_array_header_1_0, [], []
+
+    def slowly(file):
+        parsing.append(file)
+        time.sleep(0.01)
+        most.append(len(parsing))
+        parsing.pop()
+        return parse(file)
+
+    monkeypatch.setattr(np.lib.format, "read_array_header_1_0", slowly)
+    EpisodeStore(store).verify([0, 1, 2])
+    assert most == [1] * 9  # three arrays of three episodes
 
 
 def test_a_missing_file_is_damage_too(store):
