@@ -1,5 +1,6 @@
 """Read files that may be damaged. Errors are one sentence: which file, what is wrong, what to do."""
 
+import gzip
 import io
 import json
 from collections.abc import Iterator
@@ -55,10 +56,10 @@ def is_number(value: object) -> bool:
 
 
 def read_json(path: Path, remedy: str) -> Any:
-    """Read a JSON file."""
+    """Read a JSON file, compressed if its name ends in `.gz`."""
     content = path.read_bytes()
     with readable(path, "JSON", remedy):
-        return json.loads(content)
+        return json.loads(gzip.decompress(content) if path.suffix == ".gz" else content)
 
 
 def read_yaml(path: Path, remedy: str) -> Any:

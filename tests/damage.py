@@ -1,6 +1,7 @@
 """Kinds of files that forbes reads, and damage done to them."""
 
 import dataclasses
+import gzip
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -100,6 +101,11 @@ KINDS = [
     Kind(
         "curves.json",
         lambda path: write_lines(path, [[{"task": "t", "method": "m", "seed": 0, "xs": [0, 5], "ys": [1.5, 2]}]]),
+        lambda path: published_curves(str(path), "t"),
+    ),
+    Kind(
+        "curves.json.gz",
+        lambda path: path.write_bytes(gzip.compress(b'[{"task": "t", "method": "m", "xs": [0, 5], "ys": [1.5, 2]}]')),
         lambda path: published_curves(str(path), "t"),
     ),
 ]

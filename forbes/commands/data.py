@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from forbes.choices import Dataset, Fetched, Origin, Split
-from forbes.data.download import CURVES_BLOB, curves_path, fetch_curves, git_blob_id
+from forbes.data.download import data_folder, fetch_curves
 from forbes.data.strokes.classifier_training import classify, digits_of, quality, train_classifiers
 from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, classifiers_path, save_weights
 from forbes.data.strokes.comparison import compare_sets
@@ -77,16 +77,14 @@ def fetch(dataset: Fetched, from_: Path | None = None) -> None:
 
     Args:
         dataset: `strokes`, the paper's stroke set by Edwin D. de Jong (CC BY-SA 3.0), or `curves`, the learning curves
-            of Dreamer on DeepMind Control (MIT).
+            of Dreamer and DreamerV3 on DeepMind Control (MIT).
         from_: local copy to use instead of a download. For strokes: the tarball, its extracted folder, or a converted
-            `.npz`.
+            `.npz`. For curves: one of the files.
     """
     if dataset == "curves":
-        if from_ is None and curves_path().is_file() and git_blob_id(curves_path()) == CURVES_BLOB:
-            print(f"{curves_path()}: already stored and verified")
-            return
-        fetch_curves(from_, curves_path())
-        print(f"{curves_path()}: stored; figures/return.png of agents on DeepMind Control shows them for comparison")
+        for file, is_new in fetch_curves(from_, data_folder()):
+            print(f"{file}: {'stored' if is_new else 'already stored and verified'}")
+        print("figures/return.png of agents on DeepMind Control shows them for comparison")
         return
     path = dejong_path()
     if from_ is None and path.is_file():

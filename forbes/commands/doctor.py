@@ -14,7 +14,7 @@ from rich.table import Column, Table
 
 import forbes
 from forbes.commands.parsers.doctor import parser
-from forbes.data.download import curves_path
+from forbes.data.download import curves_paths
 from forbes.data.strokes.classifiers import classifiers_path
 from forbes.data.strokes.dejong import dejong_path
 from forbes.data.strokes.source import bundled_path
@@ -130,7 +130,7 @@ def _data() -> Iterator[Finding]:
         ("strokes, bundled", bundled_path(), "forbes data build-strokes --images DIR", True),
         ("digit classifiers", classifiers_path(), "reinstall forbes, if you need forbes completions", False),
         ("strokes, de Jong", dejong_path(), "forbes data fetch strokes (optional: the paper's data set)", False),
-        ("curves of Dreamer", curves_path(), "forbes data fetch curves (optional: to compare agents with)", False),
+        *(("curves to compare with", path, "forbes data fetch curves (optional)", False) for path in curves_paths()),
     ):
         found = path.is_file()
         yield Finding(name, str(path) if found else f"no {path}", "" if found else remedy, needed and not found)

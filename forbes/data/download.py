@@ -1,38 +1,53 @@
 """Download, verify and locate data that are not part of the package.
 
-This includes the learning curves of danijar/dreamer on the DeepMind Control Suite (MIT licence).
+This includes the learning curves of danijar/dreamer and danijar/dreamerv3 on the DeepMind Control Suite (MIT licence).
 """
 
 import hashlib
 import http
 import http.client
 import os
-import shutil
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
 from forbes.errors import ForbesError
-from forbes.files import append_whole
+from forbes.files import append_whole, replace_file
 
-__all__ = [
-    "CURVES_BLOB",
-    "CURVES_URL",
-    "curves_path",
-    "data_folder",
-    "download",
-    "fetch_curves",
-    "git_blob_id",
-]
+__all__ = ["CURVES", "Curves", "curves_paths", "data_folder", "download", "fetch_curves", "git_blob_id"]
 
 _DOWNLOAD_LIMIT = 100 * 2**20  # bytes; GitHub stores no larger file
 _CHUNK = 2**16
 
-CURVES_URL = "https://github.com/danijar/dreamer/raw/master/scores/dreamer.json"
-CURVES_BLOB = "ab35b223497127c8eb4cf1b17db7afd4389c4faf"
-"""Git blob id of the curves: 20 tasks with 5 seeds each, returns against env steps up to 4.9 million."""
+
+class Curves(NamedTuple):
+    """A published file of learning curves on the DeepMind Control Suite: returns against env steps."""
+
+    name: str
+    """Name of the file where it is stored."""
+    url: str
+    blob: str
+    """Git blob id of its content."""
+
+
+CURVES = (
+    # Dreamer: 20 tasks with 5 seeds each, up to 4.9 million env steps
+    Curves(
+        "dreamer-curves.json",
+        "https://github.com/danijar/dreamer/raw/master/scores/dreamer.json",
+        "ab35b223497127c8eb4cf1b17db7afd4389c4faf",
+    ),
+    # DreamerV3, from pixels: 20 tasks with 10 seeds each, up to a million env steps
+    Curves(
+        "dreamerv3-curves.json.gz",
+        "https://github.com/danijar/dreamerv3/raw/2411f7d136832378c0291c587cdbf2fca6506873/scores/dmc_vision-dreamerv3.json.gz",
+        "bb501624a6da2509912f787d715afba564d6d45f",
+    ),
+)
 
 _LOCAL = "Give a local copy with: forbes data fetch curves --from PATH"
 
@@ -101,31 +116,47 @@ def git_blob_id(path: Path) -> str:
     return digest.hexdigest()
 
 
-def curves_path() -> Path:
-    """Return the path of the downloaded curves."""
-    return data_folder() / "dreamer-curves.json"
+def curves_paths() -> list[Path]:
+    """Return the paths of the downloaded curves, those of Dreamer first."""
+    return [data_folder() / curves.name for curves in CURVES]
 
 
-def fetch_curves(source: Path | None, destination: Path) -> None:
-    """Download or copy the curves, and verify them.
+def fetch_curves(source: Path | None, folder: Path) -> Iterator[tuple[Path, bool]]:
+    """Download the curves that are not stored yet, or copy a file of them, and verify them.
 
     Args:
-        source: local copy of the file; None downloads it.
-        destination: file to write, complete or not at all.
+        source: local copy of one of the files; None downloads all.
+        folder: where to write each file, complete or not at all.
+
+    Yields:
+        The path of a stored file, and whether it is new.
 
     Raises:
-        ForbesError: if the file cannot be downloaded, or its hash is wrong.
+        ForbesError: if a file cannot be downloaded, or its hash is wrong.
     """
-    new = destination.with_name(f"{destination.name}.new")
-    if source is None:
-        download(CURVES_URL, new, _LOCAL)
-    elif source.is_file():
-        new.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source, new)
-    else:
+    if source is not None:
+        yield _copy_curves(source, folder), True
+        return
+    for curves in CURVES:
+        path = folder / curves.name
+        if path.is_file() and git_blob_id(path) == curves.blob:
+            yield path, False
+        else:
+            new = path.with_name(f"{path.name}.new")
+            download(curves.url, new, _LOCAL)
+            if (found := git_blob_id(new)) != curves.blob:
+                new.unlink()
+                raise ForbesError(f"{curves.url}: the git blob id is {found}, expected {curves.blob}. {_LOCAL}")
+            new.replace(path)
+            yield path, True
+
+
+def _copy_curves(source: Path, folder: Path) -> Path:
+    """Copy a file of curves to its name."""
+    if not source.is_file():
         raise ForbesError(f"{source}: no such file. {_LOCAL}")
-    found = git_blob_id(new)
-    if found != CURVES_BLOB:
-        new.unlink()
-        raise ForbesError(f"{source or CURVES_URL}: the git blob id is {found}, expected {CURVES_BLOB}. {_LOCAL}")
-    new.replace(destination)
+    found, names = git_blob_id(source), {curves.blob: curves.name for curves in CURVES}
+    if found not in names:
+        raise ForbesError(f"{source}: the git blob id is {found}, expected {' or '.join(names)}. {_LOCAL}")
+    replace_file(folder / names[found], source.read_bytes())
+    return folder / names[found]

@@ -7,18 +7,29 @@ its authors' curves by `at_step`; all others are copied.
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
 from forbes.bundled import bundled
-from forbes.data.download import curves_path
+from forbes.data.download import curves_paths
 from forbes.errors import ForbesError
 from forbes.reading import read_json, readable
 
 __all__ = ["SPREAD", "at_step", "published_curves", "published_numbers", "published_path", "published_returns"]
 
+_BIN = 10_000
+"""Env steps that are one point of a curve: DreamerV3's has eight episodes after every 8,000."""
+
 SPREAD = "return, standard deviation over seeds"
 """Metric of the spread of a published return."""
+
+
+class _Curve(NamedTuple):
+    task: str
+    method: str
+    returns: pd.Series
+    """By env steps."""
 
 
 def published_path() -> Path:
@@ -62,31 +73,44 @@ def at_step(curves: Sequence[pd.Series], step: float) -> tuple[float, float]:
 def published_curves(path: str | None, task: str) -> dict[str, list[pd.Series]]:
     """Read the published curves of a task: returns against env steps by method, one per seed.
 
+    The episodes within 10,000 env steps are one point, their mean.
+
     Args:
         path: file with a JSON list of `{"task": …, "method": …, "seed": …, "xs": [env steps], "ys": [returns]}`, as
-            published by the authors of Dreamer; their task names may begin with `dmc_`. None for the file of
-            `forbes data fetch curves`, which gives no curves if it is missing or lacks the task.
+            published by the authors of Dreamer; their task names may begin with `dmc_`. None for the files of
+            `forbes data fetch curves`, which give no curves if they are missing or lack the task.
         task: name of the task, e.g. `cartpole_swingup`.
 
     Raises:
-        ForbesError: if the file is invalid, or a file given by `path` lacks the task.
+        ForbesError: if a file is invalid, or a file given by `path` lacks the task.
     """
-    if path is None and not curves_path().is_file():
-        return {}
+    files = [Path(path)] if path else [file for file in curves_paths() if file.is_file()]
     names = {task, f"dmc_{task}", f"dmc_{task.removeprefix('ball_in_')}"}  # Dreamer calls ball_in_cup_catch cup_catch
     curves: dict[str, list[pd.Series]] = {}
     known = set()
-    file, remedy = Path(path or curves_path()), "Name another, or none"
-    if not file.is_file():
-        raise ForbesError(f"{file}: no such file. {remedy}")
-    found = read_json(file, remedy)
-    with readable(file, "a file of curves, expected a JSON list of task, method, seed, xs and ys", remedy):
-        for one in found:
-            known.add(one["task"])
-            if one["task"] in names:
-                curve = pd.Series(one["ys"], index=one["xs"], dtype=float)
-                curves.setdefault(one["method"], []).append(curve)
+    for file in files:
+        for one in _read_curves(file):
+            known.add(one.task)
+            if one.task in names:
+                curves.setdefault(one.method, []).append(one.returns)
     if path and not curves:
         listed = ", ".join(sorted(known)) or "nothing"
         raise ForbesError(f"{path}: has no curve for {task}, only for {listed}. Name another file, or none")
     return curves
+
+
+def _read_curves(file: Path) -> list[_Curve]:
+    """Read all curves of a file."""
+    remedy = "Name another, or none"
+    if not file.is_file():
+        raise ForbesError(f"{file}: no such file. {remedy}")
+    found = read_json(file, remedy)
+    with readable(file, "a file of curves, expected a JSON list of task, method, seed, xs and ys", remedy):
+        return [_Curve(one["task"], one["method"], _points(one["xs"], one["ys"])) for one in found]
+
+
+def _points(steps: Sequence[float], returns: Sequence[float]) -> pd.Series:
+    """Return the mean of the returns in each bin of env steps, at the mean of their steps."""
+    table = pd.DataFrame({"step": steps, "return": returns}, dtype=float)
+    means = table.groupby(table["step"] // _BIN).mean()
+    return means.set_index("step")["return"]

@@ -20,7 +20,17 @@ from forbes.evaluation.methods import LAYERS, TRAJECTORIES, RecordedRun, group_b
 from forbes.evaluation.published import published_curves, published_returns
 from forbes.evaluation.returns import Summary, summarise
 from forbes.figures.returns import join_seeds
-from forbes.figures.style import BLACK, COLUMN, GREY, METHODS, PAGE, Method, draw_range, method_styles, paper_style
+from forbes.figures.style import (
+    BLACK,
+    COLUMN,
+    GREY,
+    PAGE,
+    Method,
+    draw_range,
+    method_styles,
+    method_title,
+    paper_style,
+)
 
 __all__ = ["PAPER_TASKS", "draw_layers", "draw_returns", "draw_returns_1m", "draw_trajectories", "draw_trajectories_n"]
 __all__ += ["summarise_returns", "variant_styles"]
@@ -207,7 +217,7 @@ def _draw_legend(figure: Figure, first: Sequence[str], columns: int) -> None:
     lines = {str(line.get_label()): line for axes in figure.axes for line in axes.get_lines()[::-1]}
     others = [name for name in lines if name not in first and not name.startswith("_")]
     shown = [*first, *others]
-    figure.legend([lines[name] for name in shown], shown, loc="outside upper center", ncols=4 if columns > 1 else 2)
+    figure.legend([lines[name] for name in shown], shown, loc="outside upper center", ncols=3 if columns > 1 else 2)
 
 
 def _label(title: str, agents: Mapping[str, Mapping[str, AgentCurves]]) -> str:
@@ -219,15 +229,17 @@ def _label(title: str, agents: Mapping[str, Mapping[str, AgentCurves]]) -> str:
 
 
 def _draw_published(axes: Axes, task: str, end: float) -> None:
-    """Draw what is published: levels, and Dreamer's curves, or its means with their spread if they are not fetched."""
+    """Draw what is published: levels and curves; of Dreamer means with their spread if its curves are not fetched."""
     table = published_returns(task)
     for row in table[table["method"].isin(_LEVELS)].itertuples():
         label = f"{row.method}, published, {EngFormatter(sep='')(row.env_steps)} steps"
         axes.axhline(row.value, color=GREY, ls=_LEVELS[row.method], lw=0.9, label=label)
-    style = METHODS["published"]._replace(line="-")
-    if curves := published_curves(None, task).get("dreamer"):
-        draw_range(axes, join_seeds(curves).loc[: 1.02 * end], style, f"Dreamer, published, {len(curves)} seeds")
-    else:
+    published = published_curves(None, task)
+    for method, colour in (("dreamer", GREY), ("dreamerv3", BLACK)):
+        if curves := published.get(method):
+            style, label = Method(colour), f"{method_title(method)}, published"
+            draw_range(axes, join_seeds(curves).loc[: 1.02 * end], style, f"{label}, {len(curves)} seeds")
+    if "dreamer" not in published:
         points = table[(table["method"] == "Dreamer") & (table["env_steps"] <= 1.02 * end)]
         steps, means, spreads = (points[name].to_numpy() for name in ("env_steps", "value", "spread"))
         if len(points):

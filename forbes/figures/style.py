@@ -49,6 +49,7 @@ METHODS = {
     "Vector": Method("#7d4f1f", (0, (3, 3)), "X"),
     "PlaNet": Method("#882255", (0, (1, 1)), "<"),
     "Dreamer": Method(ORANGE, (0, (5, 1.5)), "s"),  # the agent on the RSSM, and drawn like it
+    "DreamerV3": Method("#cc79a7", (0, (5, 1.5, 1, 1.5, 1, 1.5)), "v"),  # on categorical states, and drawn like them
     "exact belief": Method(BLACK, "-", "*"),
     "published": Method(GREY, ":", ""),
 }
@@ -57,7 +58,9 @@ METHODS = {
 PALETTE = (BLUE, ORANGE, GREEN, BLACK, "#cc79a7", "#56b4e9", "#e69f00", GREY)
 """Colours of things that are no methods, in order."""
 
-_SPARE = tuple(style for name, style in METHODS.items() if name not in ("Dreamer", "exact belief", "published"))
+_SPARE = tuple(
+    style for name, style in METHODS.items() if name not in ("Dreamer", "DreamerV3", "exact belief", "published")
+)
 """Styles of unknown methods, in order."""
 
 _STYLE: dict[Any, Any] = {

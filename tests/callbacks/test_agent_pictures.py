@@ -203,33 +203,33 @@ def test_the_curve_has_every_return_at_its_env_steps(run, trained):
 
 def test_published_curves_are_drawn_as_mean_and_range_of_seeds(tmp_path):
     curves = [
-        ("dmc_cup_catch", 0, [0, 10, 20], [0, 1, 2]),
-        ("dmc_cup_catch", 1, [0, 10], [4, 5]),
+        ("dmc_cup_catch", 0, [0, 10_000, 20_000], [0, 1, 2]),
+        ("dmc_cup_catch", 1, [0, 10_000], [4, 5]),
         ("dmc_x", 0, [0], [9]),
     ]
     path = tmp_path / "curves.json"
     named = [dict(task=task, method="dreamer", seed=seed, xs=xs, ys=ys) for task, seed, xs, ys in curves]
     path.write_text(json.dumps(named))
-    metrics = pd.DataFrame({"env_steps": [5.0, 15.0], "return/acting": [3.0, 4.0]}, index=[1, 2])
+    metrics = pd.DataFrame({"env_steps": [5e3, 15e3], "return/acting": [3.0, 4.0]}, index=[1, 2])
 
     figure = return_curve(metrics, "cup", published_curves(str(path), "ball_in_cup_catch"))
 
     band = figure.axes[0].lines[0]
     assert band.get_label() == "Dreamer, published, 2 seeds"
-    assert band.get_xydata().tolist() == [[0, 2], [10, 3]]
+    assert band.get_xydata().tolist() == [[0, 2], [10_000, 3]]
     assert set(figure.axes[0].collections[0].get_paths()[0].vertices[:, 1]) == {0, 1, 4, 5}
-    assert figure.axes[0].get_xlim()[1] == pytest.approx(1.02 * 15)
+    assert figure.axes[0].get_xlim()[1] == pytest.approx(1.02 * 15e3)
 
 
 def test_fetched_curves_are_drawn_by_default_for_their_task(tmp_path, monkeypatch):
     monkeypatch.setenv("FORBES_DATA", str(tmp_path))
     assert published_curves(None, "walker_walk") == {}  # not fetched
 
-    named = [{"task": "dmc_walker_walk", "method": "dreamer", "seed": 0, "xs": [0, 10], "ys": [1, 2]}]
+    named = [{"task": "dmc_walker_walk", "method": "dreamer", "seed": 0, "xs": [0, 10_000], "ys": [1, 2]}]
     (tmp_path / "dreamer-curves.json").write_text(json.dumps(named))
 
     (curve,) = published_curves(None, "walker_walk")["dreamer"]
-    assert dict(curve) == {0: 1, 10: 2}
+    assert dict(curve) == {0: 1, 10_000: 2}
     assert published_curves(None, "mountain_hike") == {}
 
 

@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from forbes.commands.parsers.data import main
+from forbes.data import download
 from forbes.data.download import git_blob_id
 from forbes.data.strokes.file import load_strokes, save_strokes
 from forbes.data.strokes.source import bundled_path
@@ -76,15 +77,16 @@ def test_fetch_stores_where_forbes_data_points(make_arrays, tmp_path, monkeypatc
 def test_fetched_curves_are_stored_there_too(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FORBES_DATA", str(tmp_path / "store"))
     (tmp_path / "copy.json").write_text("[]")
-    for module in ("data.download", "commands.data"):
-        monkeypatch.setattr(f"forbes.{module}.CURVES_BLOB", git_blob_id(tmp_path / "copy.json"))
+    found = download.Curves("some-curves.json", "http://127.0.0.1:1", git_blob_id(tmp_path / "copy.json"))
+    monkeypatch.setattr(download, "CURVES", (found,))
 
     main(["fetch", "curves", "--from", str(tmp_path / "copy.json")])
 
-    assert (tmp_path / "store" / "dreamer-curves.json").read_text() == "[]"
-    assert f"{tmp_path / 'store' / 'dreamer-curves.json'}: stored" in capsys.readouterr().out
+    stored = tmp_path / "store" / "some-curves.json"
+    assert stored.read_text() == "[]"
+    assert f"{stored}: stored" in capsys.readouterr().out
     main(["fetch", "curves"])  # nothing is downloaded again
-    assert "already stored and verified" in capsys.readouterr().out
+    assert f"{stored}: already stored and verified" in capsys.readouterr().out
 
 
 def test_fetch_rejects_a_stored_file_that_is_not_the_papers(make_arrays, tmp_path, monkeypatch):

@@ -1,12 +1,13 @@
 """The bundled table of published numbers, against the files that it was made from."""
 
+import gzip
 import json
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from forbes.data.download import curves_path
+from forbes.data.download import curves_paths
 from forbes.errors import ForbesError
 from forbes.evaluation import published
 from forbes.evaluation.published import SPREAD, at_step, published_curves, published_numbers, published_returns
@@ -33,13 +34,25 @@ def test_dreamers_rows_are_its_curves_at_their_nearest_points(task, step):
     assert of_dreamer(task, step, SPREAD) == pytest.approx(spread, abs=0.05 + 1e-9)
 
 
-@pytest.mark.skipif(not curves_path().is_file(), reason="needs `forbes data fetch curves`")
+@pytest.mark.skipif(not curves_paths()[0].is_file(), reason="needs `forbes data fetch curves`")
 @pytest.mark.parametrize(("task", "step"), rows_of_dreamer(TASKS))
 def test_dreamers_rows_are_those_of_the_fetched_curves(task, step):
     mean, spread = at_step(published_curves(None, task)["dreamer"], step)
 
     assert of_dreamer(task, step, "return") == pytest.approx(mean, abs=0.05 + 1e-9)
     assert of_dreamer(task, step, SPREAD) == pytest.approx(spread, abs=0.05 + 1e-9)
+
+
+def test_the_episodes_of_one_evaluation_are_one_point_of_a_compressed_file(tmp_path):
+    episodes = {"xs": [8002, 8006, 16_000, 24_000], "ys": [1, 3, 5, 7]}
+    path = tmp_path / "curves.json.gz"
+    path.write_bytes(
+        gzip.compress(json.dumps([{"task": "dmc_x", "method": "dreamerv3", "seed": 0} | episodes]).encode())
+    )
+
+    (curve,) = published_curves(str(path), "x")["dreamerv3"]
+
+    assert dict(curve) == {8004: 2, 16_000: 5, 24_000: 7}
 
 
 def test_a_step_between_two_points_is_that_of_the_nearer_one():

@@ -1,5 +1,6 @@
 """The figures of agents: learning curves from run folders, seeds joined, next to what is published."""
 
+import gzip
 import json
 
 import numpy as np
@@ -120,17 +121,21 @@ def test_what_is_published_is_drawn_as_levels_and_dreamer_as_points(agents):
     assert legend(figure)[0] == "FORBES"
 
 
-def test_fetched_curves_of_dreamer_are_drawn_up_to_the_last_step(agents, tmp_path):
-    curves = [
-        {"task": "dmc_walker_walk", "method": "dreamer", "seed": seed, "xs": [5000, 405_000, 605_000], "ys": ys}
-        for seed, ys in enumerate(([0, 10, 20], [20, 30, 40]))
-    ]
+def test_fetched_curves_are_drawn_up_to_the_last_step(agents, tmp_path):
     (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "dreamer-curves.json").write_text(json.dumps(curves))
+    for method, name in (("dreamer", "dreamer-curves.json"), ("dreamerv3", "dreamerv3-curves.json.gz")):
+        curves = [
+            {"task": "dmc_walker_walk", "method": method, "seed": seed, "xs": [5000, 405_000, 605_000], "ys": ys}
+            for seed, ys in enumerate(([0, 10, 20], [20, 30, 40]))
+        ]
+        content = json.dumps(curves).encode()
+        (tmp_path / "data" / name).write_bytes(gzip.compress(content) if name.endswith(".gz") else content)
 
     axes = panels(only(draw_returns([agents["forbes"]]), "returns"))["walker_walk"]
 
-    np.testing.assert_allclose(line(axes, "Dreamer, published, 2 seeds").get_xydata(), [[5000, 10], [405_000, 20]])
+    for title in ("Dreamer", "DreamerV3"):
+        curve = line(axes, f"{title}, published, 2 seeds")
+        np.testing.assert_allclose(curve.get_xydata(), [[5000, 10], [405_000, 20]])
     assert not axes.containers
 
 

@@ -11,7 +11,8 @@ from forbes.figures.prediction_grid import colour_of
 from forbes.figures.style import METHODS, method_styles, method_title
 from forbes.training.loading import load_run
 
-TOGETHER = [name for name in METHODS if name != "Dreamer"]  # which is the RSSM's agent, and never next to the RSSM
+AGENTS = ("Dreamer", "DreamerV3")  # on RSSMs of Gaussian and of categorical states, and never next to their like
+TOGETHER = [name for name in METHODS if name not in AGENTS]
 
 # Machado et al. (2009), severity 1, for linear RGB.
 SEEN_BY = {
@@ -70,6 +71,7 @@ def test_every_colour_is_legible_on_white(method):
         ("forbes", "FORBES"),
         ("rssm_wide", "RSSM wide"),
         ("agent_dreamer", "Dreamer"),
+        ("dreamerv3", "DreamerV3"),
         ("dreamer_n4", "Dreamer n4"),
         ("FORBES (deep/forbes-0)", "FORBES (deep/forbes-0)"),
         ("exact", "exact belief"),

@@ -64,7 +64,7 @@ def _add_strokes(of_data: _Parser) -> None:
 
     summary = "Download a data set that is not bundled, verify its hash, and store it."
     get = of_data.add("fetch", "forbes.commands.data:fetch", summary, "fetch strokes --from sequences.tar.gz")
-    get.add_argument("dataset", choices=get_args(Fetched), help="the paper's strokes, or Dreamer's learning curves")
+    get.add_argument("dataset", choices=get_args(Fetched), help="the paper's strokes, or learning curves of agents")
     of_strokes = "for strokes the tarball, its extracted folder or an .npz"
     get.add_argument("--from", dest="from_", type=Path, metavar="PATH", help=f"local copy to use; {of_strokes}")
 

@@ -322,26 +322,36 @@ def few_curves(server, tmp_path, monkeypatch):
     """Let the published curves be what the server has, and give a copy of them."""
     copy = tmp_path / "copy.json"
     copy.write_bytes(server.content)
-    monkeypatch.setattr(downloads, "CURVES_URL", server.url)
-    monkeypatch.setattr(downloads, "CURVES_BLOB", git_blob_id(copy))
+    monkeypatch.setattr(downloads, "CURVES", (downloads.Curves("curves.json", server.url, git_blob_id(copy)),))
     return copy
 
 
 @pytest.mark.parametrize("local", [False, True])
 def test_curves_are_downloaded_or_copied_and_lie_there_whole(local, few_curves, tmp_path):
-    fetch_curves(few_curves if local else None, tmp_path / "store" / "curves.json")
+    stored = list(fetch_curves(few_curves if local else None, tmp_path / "store"))
 
+    assert stored == [(tmp_path / "store" / "curves.json", True)]
     assert (tmp_path / "store" / "curves.json").read_bytes() == few_curves.read_bytes()
     assert [path.name for path in (tmp_path / "store").iterdir()] == ["curves.json"]
 
 
+def test_only_curves_that_are_not_there_are_downloaded(few_curves, server, tmp_path, monkeypatch):
+    missing = downloads.CURVES[0]._replace(name="others.json")
+    few_curves.rename(tmp_path / "curves.json")
+    monkeypatch.setattr(downloads, "CURVES", (downloads.CURVES[0]._replace(url="http://127.0.0.1:1"), missing))
+
+    stored = list(fetch_curves(None, tmp_path))
+
+    assert stored == [(tmp_path / "curves.json", False), (tmp_path / "others.json", True)]
+
+
 @pytest.mark.parametrize("local", [False, True])
 def test_other_curves_are_refused_and_those_that_were_there_stay(local, few_curves, tmp_path, monkeypatch):
-    monkeypatch.setattr(downloads, "CURVES_BLOB", "0" * 40)
+    monkeypatch.setattr(downloads, "CURVES", (downloads.CURVES[0]._replace(blob="0" * 40),))
     (tmp_path / "curves.json").write_text("before")
 
     with pytest.raises(ForbesError, match=r"the git blob id is .*, expected 0{40}\. Give a local copy with"):
-        fetch_curves(few_curves if local else None, tmp_path / "curves.json")
+        list(fetch_curves(few_curves if local else None, tmp_path))
 
     assert (tmp_path / "curves.json").read_text() == "before"
     assert not (tmp_path / "curves.json.new").exists()
@@ -349,4 +359,4 @@ def test_other_curves_are_refused_and_those_that_were_there_stay(local, few_curv
 
 def test_a_copy_of_the_curves_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ForbesError, match=r"absent\.json: no such file\. Give a local copy with"):
-        fetch_curves(tmp_path / "absent.json", tmp_path / "curves.json")
+        list(fetch_curves(tmp_path / "absent.json", tmp_path))
