@@ -39,6 +39,8 @@ def method_of(config: dict[str, Any]) -> str:
     belief = prior if prior and posterior == "GaussianBelief" else posterior  # FORBES may have a flow in one only
     if belief == "GaussianBelief":
         return _GAUSSIAN.get(learner := class_of(config["model"]), learner)
+    if belief == "CategoricalBelief" and arguments.get("two_hot"):
+        return "DreamerV3"
     return "FORBES" if belief == "FlowBelief" else belief.removesuffix("Belief")
 
 

@@ -20,6 +20,7 @@ def titles(folders, always=()):
         ("ImaginationActorCritic", "FlowBelief", {}, "FORBES"),
         ("ImaginationActorCritic", "CategoricalBelief", {}, "Categorical"),
         ("PlanningAgent", "GaussianBelief", {}, "PlaNet"),
+        ("ImaginationActorCritic", "CategoricalBelief", {"two_hot": True}, "DreamerV3"),
         ("WorldModel", "GaussianBelief", {}, "RSSM"),
         ("WorldModel", "GaussianBelief", {"prior": "{class_path: forbes.FlowBelief}"}, "FORBES"),
         ("WorldModel", "GaussianBelief", {"model": "{class_path: forbes.VectorModel}"}, "Vector"),
