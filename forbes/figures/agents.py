@@ -55,8 +55,8 @@ class AgentCurves(NamedTuple):
 def draw_returns(runs: Sequence[str]) -> dict[str, Figure]:
     """Draw Figure 6, returns up to 500,000 env steps, and print their summary.
 
-    If a run has one of the paper's tasks, there is a panel for each of the six. A panel without a run says so. The
-    returns of tasks that are not of DeepMind Control are drawn to their end.
+    If the runs have several of the paper's tasks, there is a panel for each of the six. A panel without a run says so.
+    The returns of tasks that are not of DeepMind Control are drawn to their end.
 
     Raises:
         ForbesError: if a run has no measured returns, or the seeds of a method have no step in common.
@@ -73,7 +73,7 @@ def _returns(runs: Sequence[str], limit: int) -> Figure:
     agents = _read([read_run(path) for path in runs], limit)
     for title, summary in _summaries(agents).items():
         print(title, *summary.lines(), sep="\n")
-    if any(task in PAPER_TASKS for task in agents):
+    if sum(task in PAPER_TASKS for task in agents) > 1:
         agents = {task: agents.get(task, {}) for task in (*PAPER_TASKS, *agents)}
     return _draw(agents, published=True)
 
@@ -213,11 +213,15 @@ def _ends(agents: Mapping[str, Mapping[str, AgentCurves]]) -> dict[str, float]:
 
 
 def _draw_legend(figure: Figure, first: Sequence[str], columns: int) -> None:
-    """Draw one legend for all panels, agents first."""
+    """Draw one legend for all panels, agents first: above them, or beside a single panel of many lines."""
     lines = {str(line.get_label()): line for axes in figure.axes for line in axes.get_lines()[::-1]}
     others = [name for name in lines if name not in first and not name.startswith("_")]
     shown = [*first, *others]
-    figure.legend([lines[name] for name in shown], shown, loc="outside upper center", ncols=3 if columns > 1 else 2)
+    place, across = "outside upper center", 3 if columns > 1 else 2
+    if columns == 1 and len(shown) > 4:
+        figure.set_size_inches(PAGE, figure.get_figheight())
+        place, across = "outside right upper", 1
+    figure.legend([lines[name] for name in shown], shown, loc=place, ncols=across)
 
 
 def _label(title: str, agents: Mapping[str, Mapping[str, AgentCurves]]) -> str:

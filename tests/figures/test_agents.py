@@ -67,6 +67,19 @@ def agents(tmp_path):
     return made | {"alone": write_agent(tmp_path / "alone", "walker_run", {100_000: 1.0})}
 
 
+@pytest.fixture
+def fetched_curves(tmp_path):
+    """Curves of two methods and two seeds on one task."""
+    (tmp_path / "data").mkdir()
+    for method, name in (("dreamer", "dreamer-curves.json"), ("dreamerv3", "dreamerv3-curves.json.gz")):
+        curves = [
+            {"task": "dmc_walker_walk", "method": method, "seed": seed, "xs": [5000, 405_000, 605_000], "ys": ys}
+            for seed, ys in enumerate(([0, 10, 20], [20, 30, 40]))
+        ]
+        content = json.dumps(curves).encode()
+        (tmp_path / "data" / name).write_bytes(gzip.compress(content) if name.endswith(".gz") else content)
+
+
 def test_seeds_meet_at_all_steps_that_all_have_reached():
     joined = join_seeds([pd.Series({10: 0.0, 30: 4.0}), pd.Series({10: 2.0, 20: 8.0, 40: 0.0})])
 
@@ -103,8 +116,19 @@ def test_figure_6_has_the_papers_six_panels_and_says_which_have_no_run(agents):
     assert all(axes.get_xlim() == (0, 1.02 * 500_000) for axes in figure.axes)
 
 
+@pytest.mark.parametrize(("names", "tasks"), [(["forbes"], ["walker_walk"]), (["forbes", "alone"], PAPER_TASKS)])
+def test_a_single_task_is_one_panel_and_the_whole_legend_is_seen(names, tasks, agents, fetched_curves):
+    figure = only(draw_returns([agents[name] for name in names]), "returns")
+
+    assert list(panels(figure)) == list(tasks)
+    figure.canvas.draw()
+    seen, whole = figure.legends[0].get_window_extent(), figure.bbox
+    assert whole.x0 <= seen.x0 < seen.x1 <= whole.x1
+    assert whole.y0 <= seen.y0 < seen.y1 <= whole.y1
+
+
 def test_what_is_published_is_drawn_as_levels_and_dreamer_as_points(agents):
-    figure = only(draw_returns([agents["forbes"]]), "returns")
+    figure = only(draw_returns([agents["forbes"], agents["alone"]]), "returns")
 
     shown = panels(figure)
     levels = {
@@ -121,16 +145,7 @@ def test_what_is_published_is_drawn_as_levels_and_dreamer_as_points(agents):
     assert legend(figure)[0] == "FORBES"
 
 
-def test_fetched_curves_are_drawn_up_to_the_last_step(agents, tmp_path):
-    (tmp_path / "data").mkdir()
-    for method, name in (("dreamer", "dreamer-curves.json"), ("dreamerv3", "dreamerv3-curves.json.gz")):
-        curves = [
-            {"task": "dmc_walker_walk", "method": method, "seed": seed, "xs": [5000, 405_000, 605_000], "ys": ys}
-            for seed, ys in enumerate(([0, 10, 20], [20, 30, 40]))
-        ]
-        content = json.dumps(curves).encode()
-        (tmp_path / "data" / name).write_bytes(gzip.compress(content) if name.endswith(".gz") else content)
-
+def test_fetched_curves_are_drawn_up_to_the_last_step(agents, fetched_curves):
     axes = panels(only(draw_returns([agents["forbes"]]), "returns"))["walker_walk"]
 
     for title in ("Dreamer", "DreamerV3"):
@@ -152,7 +167,7 @@ def test_other_tasks_are_drawn_to_their_end(agents, tmp_path):
     gym = write_agent(tmp_path / "gym", "gymnasium:Walk-v1", {1_000: 3, 2_000_000: 4_000})
     hike = write_agent(tmp_path / "hike", "mountain_hike", {10: -100, 20: -90})
 
-    shown = panels(only(draw_returns([agents["forbes"], gym, hike]), "returns"))
+    shown = panels(only(draw_returns([agents["forbes"], agents["alone"], gym, hike]), "returns"))
 
     assert list(shown) == [*PAPER_TASKS, "gymnasium:Walk-v1", "mountain_hike"]
     ends = {task: axes.get_xlim()[1] / 1.02 for task, axes in shown.items()}
