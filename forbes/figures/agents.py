@@ -217,11 +217,12 @@ def _draw_legend(figure: Figure, first: Sequence[str], columns: int) -> None:
     lines = {str(line.get_label()): line for axes in figure.axes for line in axes.get_lines()[::-1]}
     others = [name for name in lines if name not in first and not name.startswith("_")]
     shown = [*first, *others]
-    place, across = "outside upper center", 3 if columns > 1 else 2
+    handles = [lines[name] for name in shown]
     if columns == 1 and len(shown) > 4:
         figure.set_size_inches(PAGE, figure.get_figheight())
-        place, across = "outside right upper", 1
-    figure.legend([lines[name] for name in shown], shown, loc=place, ncols=across)
+        figure.legend(handles, shown, loc="outside right upper")
+    else:
+        figure.legend(handles, shown, loc="outside upper center", ncols=3 if columns > 1 else 2)
 
 
 def _label(title: str, agents: Mapping[str, Mapping[str, AgentCurves]]) -> str:
