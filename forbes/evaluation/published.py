@@ -7,7 +7,6 @@ its authors' curves by `at_step`; all others are copied.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import pandas as pd
 
@@ -23,13 +22,6 @@ _BIN = 10_000
 
 SPREAD = "return, standard deviation over seeds"
 """Metric of the spread of a published return."""
-
-
-class _Curve(NamedTuple):
-    task: str
-    method: str
-    returns: pd.Series
-    """By env steps."""
 
 
 def published_path() -> Path:
@@ -84,29 +76,24 @@ def published_curves(path: str | None, task: str) -> dict[str, list[pd.Series]]:
     Raises:
         ForbesError: if a file is invalid, or a file given by `path` lacks the task.
     """
+    remedy = "Name another, or none"
+    if path and not Path(path).is_file():
+        raise ForbesError(f"{path}: no such file. {remedy}")
     files = [Path(path)] if path else [file for file in curves_paths() if file.is_file()]
     names = {task, f"dmc_{task}", f"dmc_{task.removeprefix('ball_in_')}"}  # Dreamer calls ball_in_cup_catch cup_catch
     curves: dict[str, list[pd.Series]] = {}
     known = set()
     for file in files:
-        for one in _read_curves(file):
-            known.add(one.task)
-            if one.task in names:
-                curves.setdefault(one.method, []).append(one.returns)
+        found = read_json(file, remedy)
+        with readable(file, "a file of curves, expected a JSON list of task, method, seed, xs and ys", remedy):
+            for one in found:
+                known.add(one["task"])
+                if one["task"] in names:
+                    curves.setdefault(one["method"], []).append(_points(one["xs"], one["ys"]))
     if path and not curves:
         listed = ", ".join(sorted(known)) or "nothing"
         raise ForbesError(f"{path}: has no curve for {task}, only for {listed}. Name another file, or none")
     return curves
-
-
-def _read_curves(file: Path) -> list[_Curve]:
-    """Read all curves of a file."""
-    remedy = "Name another, or none"
-    if not file.is_file():
-        raise ForbesError(f"{file}: no such file. {remedy}")
-    found = read_json(file, remedy)
-    with readable(file, "a file of curves, expected a JSON list of task, method, seed, xs and ys", remedy):
-        return [_Curve(one["task"], one["method"], _points(one["xs"], one["ys"])) for one in found]
 
 
 def _points(steps: Sequence[float], returns: Sequence[float]) -> pd.Series:
