@@ -26,7 +26,7 @@ def return_curve(metrics: "pd.DataFrame", task: str, published: "Mapping[str, Se
     table = metrics.reindex(columns=["env_steps", "return/acting", "return/exploring"]).set_index("env_steps")
     acting, exploring = (table[name].dropna() for name in table)
     with paper_style():
-        figure = Figure((COLUMN, 2.3), layout="constrained")
+        figure = Figure((COLUMN, 2.7), layout="constrained")
         axes = figure.subplots()
         for method, style in method_styles([*published]).items():
             curves = published[method]
@@ -36,6 +36,7 @@ def return_curve(metrics: "pd.DataFrame", task: str, published: "Mapping[str, Se
         axes.plot(exploring.index, exploring, color=GREY, lw=0.6, label="exploring", marker=marker)
         axes.plot(acting.index, acting, ".-", color=BLACK, markersize=3, label="acting, without exploration")
         _label(axes, task, table.index.max())
+        figure.legend(loc="outside upper center")
     return figure
 
 
@@ -51,4 +52,3 @@ def _label(axes: Axes, task: str, end: float) -> None:
     axes.set_xlim(0, 1.02 * end)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
     axes.locator_params("x", nbins=6)
-    axes.legend(loc="best")
