@@ -65,8 +65,8 @@ def _add_strokes(of_data: _Parser) -> None:
     summary = "Download a data set that is not bundled, verify its hash, and store it."
     get = of_data.add("fetch", "forbes.commands.data:fetch", summary, "fetch strokes --from sequences.tar.gz")
     get.add_argument("dataset", choices=get_args(Fetched), help="the paper's strokes, or learning curves of agents")
-    of_strokes = "for strokes the tarball, its extracted folder or an .npz"
-    get.add_argument("--from", dest="from_", type=Path, metavar="PATH", help=f"local copy to use; {of_strokes}")
+    copies = "for strokes the tarball, its extracted folder or an .npz; for curves one of the files"
+    get.add_argument("--from", dest="from_", type=Path, metavar="PATH", help=f"local copy to use; {copies}")
 
     summary = "Print measures of similarity of two stroke files of the same digits."
     example = "compare-strokes data/strokes.npz dejong-strokes.npz"
