@@ -7,6 +7,7 @@ hooks of its own. The processes are forked from one that has imported everything
 
 import atexit
 import fcntl
+import gc
 import os
 import re
 import signal
@@ -67,6 +68,7 @@ def run(
     output, operations = _Pipe(), _Pipe()
     process = os.fork()
     if process == 0:
+        gc.freeze()  # what there is belongs to the parent, see `forked`
         files = output.written, operations.written
         _command([str(argument) for argument in arguments], folder, fault, before, *files)
     status = os.waitstatus_to_exitcode(_wait(process, fault))

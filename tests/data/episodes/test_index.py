@@ -1,7 +1,6 @@
 """The index of a store: bounded, restored where it is lost, and never at odds with the files for want of one line."""
 
 import json
-import multiprocessing
 import os
 import signal
 from dataclasses import dataclass
@@ -9,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forked import run_in_a_fork
 
 from forbes.commands.cli import main
 from forbes.data import Replay
@@ -116,11 +116,7 @@ def test_a_kill_while_the_index_is_compacted_loses_nothing(store, monkeypatch, w
         if len(calls) == when:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    process = multiprocessing.get_context("fork").Process(target=at_each_sync, args=(store, monkeypatch, kill))
-    process.start()
-    process.join()
-
-    assert process.exitcode == -signal.SIGKILL
+    assert run_in_a_fork(at_each_sync, store, monkeypatch, kill) == -signal.SIGKILL
     assert Said.by(store) == before
     with EpisodeWriter(store) as writer:
         append(writer)

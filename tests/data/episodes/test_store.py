@@ -3,13 +3,13 @@
 import errno
 import hashlib
 import json
-import multiprocessing
 import os
 import signal
 import time
 
 import numpy as np
 import pytest
+from forked import run_in_a_fork
 
 from forbes.data.episodes.episode import DamagedEpisodeError, Episode, map_episode, stamp_of
 from forbes.data.episodes.replay import Replay
@@ -143,10 +143,7 @@ def kill_at_sync(path, when):
 
 @pytest.mark.parametrize("when", range(1, 7))  # an episode is synced, its folder, and the index
 def test_a_kill_while_writing_leaves_whole_episodes_only(store, when):
-    process = multiprocessing.get_context("fork").Process(target=kill_at_sync, args=(store, when))
-    process.start()
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
+    assert run_in_a_fork(kill_at_sync, store, when) == -signal.SIGKILL
 
     left = numbers(store)
     assert left in ([0, 1, 2], [0, 1, 2, 3], [0, 1, 2, 3, 4])

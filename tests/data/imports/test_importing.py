@@ -1,6 +1,5 @@
 """An import ends with a whole store or with none, after a kill too, and needs the memory of one episode."""
 
-import multiprocessing
 import os
 import signal
 import tracemalloc
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import recordings
+from forked import run_in_a_fork
 
 from forbes.choices import EXPORTS
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
@@ -76,11 +76,7 @@ def import_and_die(recorded, output, when):
 def test_a_killed_import_continues_to_the_same_bytes(when, recorded, tmp_path):
     imported(recorded, tmp_path / "whole")
     store = tmp_path / "store"
-    process = multiprocessing.get_context("fork").Process(target=import_and_die, args=(recorded, store, when))
-    process.start()
-    process.join()
-
-    assert process.exitcode == -signal.SIGKILL
+    assert run_in_a_fork(import_and_die, recorded, store, when) == -signal.SIGKILL
     assert store.exists() == (when == 22)
     if not store.exists():
         imported(recorded, store)
