@@ -51,16 +51,13 @@ METHODS = {
     "Dreamer": Method(ORANGE, (0, (5, 1.5)), "s"),  # the agent on the RSSM, and drawn like it
     "DreamerV3": Method("#cc79a7", (0, (5, 1.5, 1, 1.5, 1, 1.5)), "v"),  # on categorical states, and drawn like them
     "exact belief": Method(BLACK, "-", "*"),
-    "published": Method(GREY, ":", ""),
 }
 """Spelling and style of each method. The colours differ in hue and brightness (after Okabe and Ito)."""
 
 PALETTE = (BLUE, ORANGE, GREEN, BLACK, "#cc79a7", "#56b4e9", "#e69f00", GREY)
 """Colours of things that are no methods, in order."""
 
-_SPARE = tuple(
-    style for name, style in METHODS.items() if name not in ("Dreamer", "DreamerV3", "exact belief", "published")
-)
+_SPARE = tuple(dict.fromkeys(style for name, style in METHODS.items() if name != "exact belief"))
 """Styles of unknown methods, in order."""
 
 _STYLE: dict[Any, Any] = {
