@@ -14,13 +14,14 @@ resampled, h and s jointly; `torch.where` decides, so shapes never depend on val
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
 from forbes.errors import ForbesError, require_at_least
+from forbes.frozen import frozen
 from forbes.models.base import EncodedSequence, FrameLogProb, ModelParts, State
 from forbes.models.elbo import KL, ElboTerms
 from forbes.models.posterior import Filtered, PosteriorModel
@@ -173,6 +174,7 @@ class ParticleModel(StateSpaceModel):
 
     With K = 1 it is the RSSM itself. DVRL resamples at every step. Here only sequences whose effective sample size is
     below K / 2 are resampled, since that adds variance. As in DVRL, the gradient leaves out the choice of ancestors.
+    Unless `kl` is "monte_carlo", the gradient of each step's posterior is the doubly reparameterised one.
 
     Args:
         parts: see `StateSpaceModel`.
@@ -208,11 +210,37 @@ class ParticleModel(StateSpaceModel):
         The reconstruction is the weighted mean :math:`\sum_k W_t^k \log p(o_t \mid h_t^k, s_t^k)`, the KL what it
         exceeds :math:`\log \hat p_t` by.
         """
-        steps = list(self._run(self.encode(observation, action)))
+        encoded = self.encode(observation, action)
+        steps = list(self._run(encoded))
         increment = torch.stack([step.increment for step in steps], 1)  # (B, T)
+        if kl != "monte_carlo" and self.posterior.reparameterised:
+            increment = increment + self._double_reparameterisation(steps, encoded)
         weighted = [(step.log_weight.exp() * step.log_likelihood).sum(0) for step in steps]
         reconstruction = torch.stack(weighted, 1)  # (B, T)
         return ElboTerms(reconstruction, kl=reconstruction - increment, analytic_kl=None, mask=mask)
+
+    def _double_reparameterisation(self, steps: Sequence[Particles], encoded: EncodedSequence) -> Tensor:
+        r"""Return zeros, `(B, T)`; added to log p̂_t, they replace a noisy part of its gradient by one of equal mean.
+
+        .. math:: E\, W_t \frac{\partial \log q(s_t \mid c)}{\partial c}
+                  = E\, W_t (1 - W_t)\, \frac{\partial \log w_t}{\partial s_t} \frac{\partial s_t}{\partial c}
+
+        The left side, where s_t is held constant, is what the gradient of log p̂_t contains; the right side replaces it
+        (Tucker et al., 2019, arXiv 1810.04152). For one particle this is `kl: path`.
+        """
+        filtered = Filtered(
+            *(torch.stack(values, 1) for values in zip(*(step.filtered for step in steps), strict=True))
+        )
+        weight = torch.stack([step.log_weight.exp() for step in steps], -1).detach()  # (K, B, T)
+        fixed = filtered._replace(hidden=filtered.hidden.detach(), context=filtered.context.detach())  # (K B, T, ...)
+        with frozen(self):  # functions of s_t alone
+            log_joint = self.log_likelihood(fixed.features.unflatten(0, weight.shape[:2]), encoded.target)
+            log_joint = log_joint + self.prior_log_prob(fixed).view(weight.shape)  # (K, B, T)
+            log_posterior = self.posterior_log_prob(fixed.state, fixed).view(weight.shape)
+        noisy = weight * filtered.log_prob.view(weight.shape)
+        kept = weight * log_posterior + weight * (1 - weight) * (log_joint - log_posterior)
+        replaced = (noisy - kept).sum(0)  # (B, T)
+        return replaced - replaced.detach()
 
     def sample_beliefs(self, encoded: EncodedSequence, samples: int) -> State:
         """See `BeliefModel.sample_beliefs`: a systematic sample of one weighted set, with repetitions."""

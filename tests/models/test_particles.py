@@ -68,14 +68,15 @@ def assert_mean_is(values, expected):
 
 
 @pytest.mark.usefixtures("same_noise")
-def test_one_particle_is_the_state_space_model(resampling):
+@pytest.mark.parametrize("kl", ["monte_carlo", "path"])
+def test_one_particle_is_the_state_space_model(resampling, kl):
     plain, batch = random_model("gaussian"), sequences()
     like = {name: getattr(plain, name) for name in ("encoder", "decoder", "likelihood", "state_dim", "hidden_dim")}
     parts = ModelParts(GaussianBelief, **like, action_dim=2, mlp_dim=9, mlp_layers=2)
     one = ParticleModel(parts, particles=1, resampling=resampling).double()
     one.load_state_dict(plain.state_dict())
 
-    terms, expected = one.lower_bound(*batch), plain.lower_bound(*batch)
+    terms, expected = one.lower_bound(*batch, kl), plain.lower_bound(*batch, kl)
     gradients, plain_gradients = (
         torch.autograd.grad(each.elbo.sum(), list(model.parameters()))
         for each, model in [(terms, one), (expected, plain)]
