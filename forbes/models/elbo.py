@@ -14,9 +14,9 @@ FreeNats = Literal["batch", "element"]
 KL = Literal["analytic", "monte_carlo", "path"]
 """How the KL is differentiated; its expected gradient is the same.
 
-- analytic: the closed form where prior and posterior have one, else as path.
-- path: log q(s) - log p(s) at the posterior's sample, with log q a function of s alone (`path_log_prob`); as
-  monte_carlo where samples are not reparameterised.
+- analytic: the closed form where prior and posterior have one, else as path; for weighted particles as monte_carlo.
+- path: log q(s) - log p(s) at the posterior's sample, with log q a function of s alone (`path_log_prob`), for weighted
+  particles doubly reparameterised; as monte_carlo where samples are not reparameterised.
 - monte_carlo: the same, with log q a function of its parameters too.
 """
 

@@ -174,7 +174,7 @@ class ParticleModel(StateSpaceModel):
 
     With K = 1 it is the RSSM itself. DVRL resamples at every step. Here only sequences whose effective sample size is
     below K / 2 are resampled, since that adds variance. As in DVRL, the gradient leaves out the choice of ancestors.
-    Unless `kl` is "monte_carlo", the gradient of each step's posterior is the doubly reparameterised one.
+    With `kl: path`, the gradient of each step's posterior is the doubly reparameterised one; otherwise it is plain.
 
     Args:
         parts: see `StateSpaceModel`.
@@ -213,7 +213,7 @@ class ParticleModel(StateSpaceModel):
         encoded = self.encode(observation, action)
         steps = list(self._run(encoded))
         increment = torch.stack([step.increment for step in steps], 1)  # (B, T)
-        if kl != "monte_carlo" and self.posterior.reparameterised:
+        if kl == "path" and self.posterior.reparameterised:
             increment = increment + self._double_reparameterisation(steps, encoded)
         weighted = [(step.log_weight.exp() * step.log_likelihood).sum(0) for step in steps]
         reconstruction = torch.stack(weighted, 1)  # (B, T)

@@ -51,7 +51,7 @@ class WorldModel(World, SeededModule):
         activation: activation of every MLP; convolutions and flows keep their ReLU.
         kl: how the KL is differentiated. "analytic": by its closed form where the family has one, else as "path".
             "path": at the posterior's sample, through the sample alone. "monte_carlo": through the posterior's
-            parameters too; this noise costs a flow thousands of updates.
+            parameters too; this noise costs a flow thousands of updates. Of a `ParticleModel`, "analytic" is this.
         free_nats: the KL below this, in nats per step, costs nothing in training.
         free_nats_per: "batch" applies them to the mean over batch and time, "element" to each step.
         kl_warmup: updates over which the weight of the KL rises from 0 to 1.
