@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import yaml
 from rich.markdown import Markdown
 
 from forbes.commands.console import console
@@ -14,11 +15,11 @@ from forbes.commands.jobs import Launcher, run_jobs
 from forbes.commands.launchers import open_launcher
 from forbes.commands.parsers.compare import parser, require_sweep
 from forbes.commands.sweep import sweep
-from forbes.commands.trainings import Training, failures, not_finished, training_job
+from forbes.commands.trainings import Training, complete_configuration, failures, not_finished, training_job
 from forbes.errors import ForbesError
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record, require_readable, results_folders
-from forbes.evaluation.runs import find_device, load_runs
+from forbes.evaluation.runs import TrainedRun, find_device, load_runs
 from forbes.figures.comparison import draw_differences, draw_per_step, draw_scores
 from forbes.figures.style import save_png_and_pdf
 from forbes.files import replace_file
@@ -26,6 +27,7 @@ from forbes.runs.checkpoint import open_checkpoint
 from forbes.runs.configs import find_config
 from forbes.runs.folder import RunFolder
 from forbes.runs.provenance import command_line, commit
+from forbes.runs.worlds import build_world, is_world
 
 __all__ = ["main"]
 
@@ -46,6 +48,7 @@ def main(argv: Sequence[str]) -> None:
         for config, of_config in zip(args.configs, folders.values(), strict=True)
         for seed, run in of_config.items()
     ]
+    _require_measurable(args, flags)
     _train(trainings, launcher)
     loaded = load_runs([of_config[0] for of_config in folders.values()])
     wanted = wanted_metrics(loaded, args)
@@ -75,6 +78,18 @@ def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, 
         if names.count(name) > 1:
             raise ForbesError(f"{config}: another configuration is called {name} too. Give the files different names")
     return {name: {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)} for name in names}
+
+
+def _require_measurable(args: Any, flags: Sequence[str]) -> None:
+    """Refuse configurations that could not be measured or compared, before days are spent on their training."""
+    untrained = []
+    for name in args.configs:
+        config = yaml.safe_load(complete_configuration(name, *flags))
+        if is_world(config):
+            world, data = build_world(config, Path(name), args.output)
+            untrained.append(TrainedRun(name, world.model, data, checkpoint="", config=config))
+    if untrained:
+        wanted_metrics(untrained, args)
 
 
 def _train(trainings: Sequence[Training], launcher: Launcher) -> None:

@@ -15,8 +15,8 @@ from forbes.runs.configuration import allowed_modules
 from forbes.runs.folder import RunFolder, read_config
 from forbes.runs.provenance import read_provenance
 
-__all__ = ["Training", "failures", "forbes_command", "is_finished", "not_finished", "require_trainable"]
-__all__ += ["training_job"]
+__all__ = ["Training", "complete_configuration", "failures", "forbes_command", "is_finished", "not_finished"]
+__all__ += ["require_trainable", "training_job"]
 
 _SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed")  # the first is linked to the others
 
@@ -86,7 +86,7 @@ def require_trainable(config: str, flags: Sequence[str]) -> None:
     Raises:
         ForbesError: the error of `forbes fit`.
     """
-    _configuration(config, *flags)
+    complete_configuration(config, *flags)
 
 
 def forbes_command(*arguments: str) -> list[str]:
@@ -102,7 +102,7 @@ def _require_same_configuration(training: Training) -> None:
     config, flags, seed, run = training
     trained = _flat(read_config(RunFolder(run).config))
     trained |= {key: str(Path(trained[key]).absolute()) for key in trained if key.endswith(".path") and trained[key]}
-    asked = _flat(yaml.safe_load(_configuration(config, *flags))) | {key: seed for key in _SEEDS}
+    asked = _flat(yaml.safe_load(complete_configuration(config, *flags))) | {key: seed for key in _SEEDS}
     asked |= {key: str(Path(asked[key]).absolute()) for key in asked if key.endswith(".path") and asked[key]}
     for key in asked:
         if key in trained and trained[key] != asked[key] and key != "trainer.callbacks":
@@ -120,7 +120,7 @@ def _flat(section: Any, name: str = "") -> dict[str, Any]:
 
 
 @cache
-def _configuration(config: str, *flags: str) -> str:
+def complete_configuration(config: str, *flags: str) -> str:
     """Return the complete configuration that `forbes fit` would train with, as YAML."""
     command = forbes_command("fit", "--config", config, *flags, "--print_config")
     asked = subprocess.run([sys.executable, *command], capture_output=True, text=True, check=False)

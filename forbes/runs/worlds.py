@@ -18,7 +18,7 @@ from forbes.runs.config_errors import building, one_sentence
 from forbes.runs.configuration import allow_modules, changed_defaults, data_paths, plain_parser, require_classes
 from forbes.runs.folder import RunFolder, read_config
 
-__all__ = ["LoadedWorld", "check_weights", "instantiate", "is_world", "open_world", "put", "weights_of"]
+__all__ = ["LoadedWorld", "build_world", "check_weights", "instantiate", "is_world", "open_world", "put", "weights_of"]
 
 _OURS = {"model": "forbes.WorldModel", "data": "forbes.SequenceDataModule"}
 """Classes that are built without Lightning. Their subclasses may be trained by any other constructor."""
@@ -54,17 +54,22 @@ def open_world(run: Path | str) -> LoadedWorld | None:
     state = weights_of(checkpoint.content, str(folder.checkpoint))
     for key, value in changed_defaults(config).items():
         put(config, key, value)
+    try:
+        world, data = build_world(config, folder.config, folder.path)
+    except ForbesError:
+        return None
+    check_weights(world, state, str(folder.checkpoint))
+    world.load_state_dict(state)
+    return LoadedWorld(world.eval().model, data, config, checkpoint.sha256)
+
+
+def build_world(config: Mapping[str, Any], file: Path, run: Path) -> tuple[World, SequenceData]:
+    """Build the untrained model and the data of a complete configuration of a `WorldModel`; raises as `instantiate`."""
     sections = {name: {key: value for key, value in config[name].items() if key != "class_path"} for name in _OURS}
     if "seed_everything" in config:
         sections["seed_everything"] = config["seed_everything"]
-    try:
-        built = instantiate(plain_parser(), sections, folder.config, folder.path)
-    except ForbesError:
-        return None
-    world: World = built.model.init_args
-    check_weights(world, state, str(folder.checkpoint))
-    world.load_state_dict(state)
-    return LoadedWorld(world.eval().model, built.data.init_args, config, checkpoint.sha256)
+    built = instantiate(plain_parser(), sections, file, run)
+    return built.model.init_args, built.data.init_args
 
 
 def is_world(config: Mapping[str, Any]) -> bool:

@@ -25,6 +25,8 @@ from forbes.runs.folder import read_metrics
 ELBO = "test/elbo[bernoulli,S=2]"
 ONE_EPOCH = ["--", "--trainer.max_epochs", "1"]
 MEASURES = ["--samples", "2", "--particles", "2", "--futures", "2", "--context", "2"]
+CONFIGURATION = trainings.complete_configuration
+"""The one in a process of its own."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -32,7 +34,8 @@ def one_process():
     """A process of its own would spend most of a test on its imports."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare_command, "run_jobs", run_here)
-        patch.setattr(trainings, "_configuration", configuration_here)
+        for module in (compare_command, trainings):
+            patch.setattr(module, "complete_configuration", configuration_here)
         yield
 
 
@@ -290,7 +293,20 @@ def test_a_folder_that_another_process_holds_is_named_with_it(configs, tmp_path,
     assert read_metrics(tmp_path / "forbes-0").index.max() == 5
 
 
-def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_path, capsys):
+def test_what_could_not_be_compared_is_refused_before_it_is_trained(configs, tmp_path, capsys):
+    def error_of(*arguments):
+        assert main(["compare", *arguments, "-o", str(tmp_path / "out")]) == 2
+        return capsys.readouterr().err.splitlines()[-1]
+
+    shorter = tmp_path / "shorter.yaml"
+    shorter.write_text(Path(configs[0]).read_text().replace("length: 6", "length: 5"))
+
+    assert "--context 100: sequence 2 of the test split of" in error_of(*configs, *MEASURES, "--context", "100")
+    assert "shorter.yaml: its data are" in error_of(*configs, str(shorter), *MEASURES)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_path, monkeypatch, capsys):
     def error_of(*arguments):
         capsys.readouterr()
         assert main(["compare", *arguments, "-o", str(tmp_path)]) == 2
@@ -300,7 +316,7 @@ def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_
     twin = tmp_path / "rssm.yaml"
     twin.write_text(Path(configs[0]).read_text())
     assert "another configuration is called rssm" in error_of(configs[0], str(twin))
-    failed = error_of(configs[0], "--", "--model.no_such_key", "1")
-    assert "1 of 1 trainings are not finished" in failed
+    monkeypatch.setattr(compare_command, "complete_configuration", CONFIGURATION)
+    assert "no_such_key" in error_of(configs[0], "--", "--model.no_such_key", "1")
     with pytest.raises(Exception, match=r"rssm-0: evaluation.json has no test/bleu"):
         compare(families, ["test/bleu"])
