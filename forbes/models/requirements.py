@@ -17,7 +17,7 @@ def require_path(kl: KL, model: BeliefModel) -> None:
     """Raise a ForbesError if the path derivative is asked of a model that has none."""
     if kl != "path":
         return
-    if type(model) is not StateSpaceModel:
+    if not isinstance(model, StateSpaceModel):
         raise ForbesError(f"WorldModel: kl is path for a {type(model).__name__}, expected analytic. Leave kl out")
     if not model.posterior.reparameterised:
         name = type(model.posterior).__name__

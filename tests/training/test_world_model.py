@@ -329,12 +329,21 @@ def test_an_update_changes_every_parameter_sooner_or_later():
     ("flags", "message"),
     [
         ({"belief": partial(CategoricalBelief, classes=2)}, "draws of a CategoricalBelief are not reparameterised"),
-        ({"belief": GaussianBelief, "model": ParticleModel}, "kl is path for a ParticleModel, expected analytic"),
+        ({"model": VectorModel, "state_dim": 0}, "kl is path for a VectorModel, expected analytic"),
     ],
 )
 def test_a_path_derivative_that_does_not_exist_is_refused(flags, message):
     with pytest.raises(ForbesError, match=message):
         make_world_model(kl="path", **flags)
+
+
+def test_particles_train_by_the_path_derivative():
+    model = make_world_model(kl="path", belief=GaussianBelief, model=ParticleModel)
+    before = [parameter.detach().clone() for parameter in model.model.posterior.parameters()]
+
+    fit(model, updates=2)
+
+    assert not any(map(torch.equal, before, model.model.posterior.parameters()))
 
 
 def test_the_first_batch_must_have_a_density(tiny_config, tmp_path, capsys):
