@@ -253,7 +253,7 @@ def _draw_published(axes: Axes, task: str, end: float) -> None:
 
 
 def _label_panel(axes: Axes, task: str, end: float, empty: bool) -> None:
-    axes.set_title(task)
+    axes.set_title(task.rpartition(":")[2])  # gymnasium:popgym:popgym-X-v0 is too wide
     axes.set_xlim(0, 1.02 * end)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
     axes.locator_params("x", nbins=5)

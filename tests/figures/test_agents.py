@@ -89,14 +89,15 @@ def test_seeds_meet_at_all_steps_that_all_have_reached():
 
 def test_seeds_of_a_method_are_a_mean_and_a_range(tmp_path):
     folders = [
-        write_agent(tmp_path / f"any-{seed}", "hike", {10: seed, 20: 3 + 2 * seed}, seed=seed) for seed in (0, 1)
+        write_agent(tmp_path / f"any-{seed}", "gymnasium:some_package:hike", {10: seed, 20: 3 + 2 * seed}, seed=seed)
+        for seed in (0, 1)
     ]
-    folders.append(write_agent(tmp_path / "gauss", "hike", {10: 7}, "GaussianBelief", 1))
+    folders.append(write_agent(tmp_path / "gauss", "gymnasium:some_package:hike", {10: 7}, "GaussianBelief", 1))
 
     figure = only(draw_returns(folders), "returns")
 
     (axes,) = figure.axes
-    assert axes.get_title() == "hike"
+    assert axes.get_title() == "hike"  # the whole task would be cut off
     assert legend(figure) == ["FORBES, 2 seeds", "Dreamer"]
     mean = line(axes, "FORBES, 2 seeds")
     np.testing.assert_allclose(mean.get_xydata(), [[10, 0.5], [20, 4]])
