@@ -226,7 +226,7 @@ class ParticleModel(StateSpaceModel):
                   = E\, W_t (1 - W_t)\, \frac{\partial \log w_t}{\partial s_t} \frac{\partial s_t}{\partial c}
 
         The left side, where s_t is held constant, is what the gradient of log p̂_t contains; the right side replaces it
-        (Tucker et al., 2019, arXiv 1810.04152). For one particle this is `kl: path`.
+        (Tucker et al., 2019, arXiv 1810.04152). For one particle this is the `path` of an RSSM.
         """
         filtered = Filtered(
             *(torch.stack(values, 1) for values in zip(*(step.filtered for step in steps), strict=True))

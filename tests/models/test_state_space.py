@@ -167,6 +167,25 @@ def test_the_gradient_of_the_bound_is_the_same_on_average(family, kl):
 
 
 @pytest.mark.usefixtures("same_noise")
+@pytest.mark.parametrize(
+    ("kind", "same"),
+    [("flow", "path"), ("mixture", "path"), ("particles", "monte_carlo"), ("soft particles", "monte_carlo")],
+)
+def test_without_a_closed_form_the_default_is_another_estimator(kind, same):
+    """With the same noise the gradients are equal, and those of the third option are not."""
+    model, batch = random_model(kind), sequences()
+    parameters = list(model.posterior.parameters())
+    default, path, plain = (
+        torch.autograd.grad(elbo_loss(model.lower_bound(*batch, kl)), parameters)
+        for kl in ("analytic", "path", "monte_carlo")
+    )
+
+    equal, other = (path, plain) if same == "path" else (plain, path)
+    torch.testing.assert_close(default, equal)
+    assert not any(torch.allclose(got, not_it) for got, not_it in zip(default, other, strict=True))
+
+
+@pytest.mark.usefixtures("same_noise")
 def test_filtering_a_prefix_gives_the_prefix(family):
     model, (observation, action, _) = random_model(family), sequences()
     embedding = model.embed(observation)
