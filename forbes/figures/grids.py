@@ -1,12 +1,14 @@
 """Grids of frames: truth, observed frames and predictions (paper, Figure 4)."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import colors
+from matplotlib import colors, rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.textpath import TextPath
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -129,29 +131,46 @@ def draw_bands(bands: Sequence[Sequence[Panel | Bars]], width: float = PAGE) -> 
     """
     first = [_first(band) for band in bands]
     height, wide = first[0].images.shape[3:]
-    margin, title, labels, between = 0.03, 0.24, 0.18, 0.07  # inches: left and right, above, below, under a band
-    above = [title if any(panel.title for panel in band) else 0.0 for band in bands]  # inches
+    margin, line, labels, between = 0.03, 0.13, 0.18, 0.07  # inches: left and right, of a title, below, under a band
     below = [labels if any(_is_labelled(panel) for panel in band) else between for band in bands]  # inches
     names = 0.5 if first[0].names else 0.0  # inches, at the left
     space = 0.7  # between panels, in frames
     columns = [panel.images.shape[1] if isinstance(panel, Panel) else _BARS_COLUMNS for panel in bands[0]]
     cell = (width - 2 * margin - names) / (sum(columns) + space * (len(columns) - 1))  # inches
+    rooms = [count * cell + 2 * margin for count in columns]  # inches, of the titles
     talls = [panel.images.shape[0] * cell * height / wide for panel in first]  # inches
-    total = sum(above) + sum(talls) + sum(below)
     with paper_style():
+        titles = [[_wrapped(panel.title, room) for panel, room in zip(band, rooms, strict=False)] for band in bands]
+        lines = [max(title.count("\n") + 1 if title else 0 for title in band) for band in titles]
+        above = [line * count + 0.11 if count else 0.0 for count in lines]  # inches
+        total = sum(above) + sum(talls) + sum(below)
         figure = Figure((width, total))
         bottom = total
-        for band, tall, room, under in zip(bands, talls, above, below, strict=True):
+        for band, of_band, tall, room, under in zip(bands, titles, talls, above, below, strict=True):
             bottom, left = bottom - room - tall, margin + names
-            for panel, count in zip(band, columns[: len(band)], strict=True):
+            for panel, title, count in zip(band, of_band, columns[: len(band)], strict=True):
                 axes = figure.add_axes((left / width, bottom / total, count * cell / width, tall / total))
                 if isinstance(panel, Panel):
                     _draw_panel(axes, panel)
                 else:
                     _draw_bars(axes, panel)
+                axes.set_title(title, color=panel.colour, pad=4)
                 left += (count + space) * cell
             bottom -= under
     return figure
+
+
+def _wrapped(title: str, width: float) -> str:
+    """Break a title into lines of at most `width` inches, after spaces and between the parts of a path."""
+    lines = [""]
+    for part in re.findall(r"[^ /_-]*[ /_-]+|[^ /_-]+", title):
+        longer = lines[-1] + part
+        points = TextPath((0, 0), longer.rstrip(), rcParams["axes.titlesize"]).get_extents().width
+        if lines[-1] and points > 72 * width:
+            lines.append(part)
+        else:
+            lines[-1] = longer
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def _is_labelled(panel: Panel | Bars) -> bool:
@@ -167,7 +186,6 @@ def _first(band: Sequence[Panel | Bars]) -> Panel:
 def _draw_panel(axes: Axes, panel: Panel) -> None:
     width = panel.images.shape[-1] + _GAP
     axes.imshow(_mosaic(panel.images, panel.colour), aspect="auto")
-    axes.set_title(panel.title, color=panel.colour, pad=4)
     axes.set_xticks([width * k + width / 2 for k in range(len(panel.labels))], panel.labels, fontsize=6, color=GREY)
     axes.tick_params(length=0, pad=2)
     tall = panel.images.shape[-2] + _GAP
@@ -189,7 +207,6 @@ def _draw_bars(axes: Axes, bars: Bars) -> None:
     for row, note in enumerate(bars.notes):
         axes.text(values - 0.5, rows - row - 0.08, note, fontsize=5, color=GREY, ha="right", va="top")
     axes.set(xlim=(-0.6, values - 0.4), ylim=(0, rows), yticks=[])
-    axes.set_title(bars.title, color=bars.colour, pad=4)
     axes.set_xticks(range(values), [str(value) for value in range(values)], fontsize=5, color=GREY)
     axes.tick_params(length=0, pad=2)
     axes.grid(False)

@@ -6,11 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from forbes.errors import ForbesError
 from forbes.figures.episodes import draw_strips, to_rgb
-from forbes.figures.grids import Panel, draw_panels, require_images
+from forbes.figures.grids import Panel, draw_bands, draw_panels, require_images
 from forbes.figures.imagination import draw_futures, draw_open_loop
 from forbes.figures.style import BLUE
 from forbes.figures.video import gif
@@ -45,6 +46,23 @@ def test_a_panel_shows_each_frame_in_its_place(channels):
     last = picture[HEIGHT + 4 : -2, 2 * WIDTH + 6 : -2]
     values = images[1, 2].numpy()
     np.testing.assert_allclose(last.transpose(2, 0, 1), 1 - to_rgb(values) if channels == 1 else to_rgb(values))
+
+
+def test_long_titles_are_broken_into_lines_that_overlap_neither_each_other_nor_a_picture():
+    names = ["FORBES (runs/strokes/forbes-40000-0)", "FORBES (pretrained/strokes-forbes), t = 30", "FORBES"]
+    panels = [Panel(name, frames(2, 3, channels=1), "black") for name in names]
+
+    figure = draw_bands([panels, panels])
+
+    canvas = FigureCanvasAgg(figure)
+    titles = [axes.title.get_window_extent(canvas.get_renderer()) for axes in figure.axes]
+    others = titles + [axes.get_window_extent() for axes in figure.axes]
+    assert all(figure.bbox.containsx(corner) for box in titles for corner in (box.x0, box.x1))
+    assert all(figure.bbox.containsy(corner) for box in titles for corner in (box.y0, box.y1))
+    assert not any(one.overlaps(other) for one in titles for other in others if one is not other)
+    assert [axes.get_title().replace("\n", "").replace(" ", "") for axes in figure.axes] == [
+        name.replace(" ", "") for name in 2 * names
+    ]
 
 
 @CHANNELS
