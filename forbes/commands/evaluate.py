@@ -146,10 +146,16 @@ def _add_references(evaluated: EvaluatedRun, jobs: Sequence[_Job], split: Split)
         if scores and job.sequences not in found:
             found[job.sequences] = references(evaluated.run.data, evaluated.run.model.likelihood, split, job.sequences)
         for metric in scores:
-            evaluated.entries[_metric_name(evaluated.run, job, metric, split)]["references"] = {
-                name: Estimate.of(values[:, job.score.context :].sum(1))._asdict()
-                for name, values in found[job.sequences].items()
+            name = _metric_name(evaluated.run, job, metric, split)
+            evaluated.entries[name]["references"] = {
+                reference: _reference(evaluated.totals[name], values[:, job.score.context :].sum(1))
+                for reference, values in found[job.sequences].items()
             }
+
+
+def _reference(scores: Tensor, reference: Tensor) -> dict[str, Any]:
+    """Return the estimate of a reference, and that of the scores minus it, paired over the sequences, `(N,)` each."""
+    return {**Estimate.of(reference)._asdict(), "difference": Estimate.of(scores - reference)._asdict()}
 
 
 def _image_entries(run: TrainedRun, jobs: Sequence[_Job], number: int, args: Any) -> dict[str, dict[str, Any]]:

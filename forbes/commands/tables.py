@@ -34,7 +34,7 @@ def print_runs(measured: Sequence[EvaluatedRun]) -> None:
 
 
 def print_references(measured: Sequence[EvaluatedRun]) -> None:
-    """Print the scores of the references on the same sequences, and explain the marks of `print_runs`."""
+    """Print the scores of the references on the same sequences, explain the marks of `print_runs`, and compare."""
     columns: dict[str, dict[str, str]] = {}
     for name, entry in itertools.chain.from_iterable(evaluated.entries.items() for evaluated in measured):
         for reference, estimate in entry.get("references", {}).items():
@@ -49,6 +49,21 @@ def print_references(measured: Sequence[EvaluatedRun]) -> None:
     if below:
         text = f"<: below this reference, so the model has learned less than it: {escape(', '.join(below))}"
         screen.print(text, soft_wrap=True)
+    differences = {
+        str(number): {name: over for name, entry in evaluated.entries.items() if (over := _over_best(entry))}
+        for number, evaluated in enumerate(measured, start=1)
+    }
+    _print(screen, "paired differences to the best of these, nats per sequence", differences)
+
+
+def _over_best(entry: Mapping[str, Any]) -> str:
+    """Return the difference of a score to its best reference, with its name; nothing if it has none."""
+    references = entry.get("references")
+    if not references:
+        return ""
+    best = max(references, key=lambda name: references[name]["mean"])
+    difference = _estimate(references[best]["difference"])
+    return f"{difference.mean:+.2f} ± {difference.standard_error:.2f}\n({best})"
 
 
 def beaten_by(entry: Mapping[str, Any]) -> str | None:

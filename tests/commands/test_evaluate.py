@@ -379,6 +379,11 @@ def test_every_score_stands_beside_its_references(runs, capsys):
         assert {reference: each["mean"] for reference, each in entry["references"].items()} == {
             reference: pytest.approx(values[:, skipped:].sum(1).mean().item()) for reference, values in expected.items()
         }
+        for reference, values in expected.items():
+            paired = torch.from_numpy(arrays_of(runs[0])[name]) - values[:, skipped:].sum(1)
+            difference = entry["references"][reference]["difference"]
+            assert difference["mean"] == pytest.approx(paired.mean().item())
+            assert difference["standard_error"] == pytest.approx(paired.std().item() / 5**0.5)
     assert "5-gram" in out
     lowest = min(expected, key=lambda reference: expected[reference].sum(1).mean())
     assert out.count(f"< {lowest}") >= 4  # hardly trained: below all of them
