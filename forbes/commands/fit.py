@@ -24,6 +24,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 import forbes.callbacks  # registers their short names for configurations
+from forbes.callbacks.collapse import WarnOfCollapse
 from forbes.callbacks.divergence import StopAtDivergence
 from forbes.callbacks.picture import FileCallback
 from forbes.commands.fit_options import FitOptions
@@ -228,7 +229,14 @@ class _Experiment(LightningCLI):
             print(f"run folder: {run}", flush=True)
         self.stop, self.together = StopOnSignal(run), EndTogether(run)
         self.save_config_kwargs = {"run": run, "stop": self.stop, "arguments": [self.command, *self.arguments]}
-        callbacks += [ResumeWholeEpochs(), MarkStart(), self.stop, self.together, StopAtDivergence(run)]
+        callbacks += [
+            ResumeWholeEpochs(),
+            MarkStart(),
+            self.stop,
+            self.together,
+            StopAtDivergence(run),
+            WarnOfCollapse(),
+        ]
         if config["enable_checkpointing"] is not False:
             callbacks.append(SaveLast(run))
         loggers = config["logger"]
