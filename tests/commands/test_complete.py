@@ -37,7 +37,7 @@ def test_completions_are_drawn_at_the_training_length_and_the_end(tiny_run):
     figure = prediction_grid(world.model, data, batch, context=3, samples=2)
 
     assert isinstance(figure, Figure)
-    titles = [axes.get_title() for axes in figure.axes]
+    titles = [axes.get_title().replace("\n", " ") for axes in figure.axes]
     assert titles == ["truth", "seen", "sampled completions, t = 6", "sampled completions, t = 9"]
 
 
