@@ -193,7 +193,7 @@ def test_a_cluster_of_another_version_is_refused_with_the_reason(tmp_path, monke
 
 
 def test_without_a_cluster_it_says_how_to_start_one(tiny_config, tmp_path, capsys):
-    options = ["--launcher", "ray", "--address", "127.0.0.1:1", "-o", tmp_path]
+    options = ["--launcher", "ray", "--address", "127.0.0.1:1", "-o", tmp_path, "--context", "2"]
 
     error = error_of(capsys, "compare", tiny_config, *options)
 
