@@ -12,6 +12,7 @@ from forbes.commands.parsers.export import parser
 from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.record import read_record
+from forbes.evaluation.references import best_reference
 from forbes.evaluation.runs import data_name
 from forbes.files import replace_file
 from forbes.runs.exported import export_run, shareable
@@ -124,12 +125,11 @@ def _estimate(entry: Mapping[str, Any]) -> str:
 
 def _best(entry: Mapping[str, Any]) -> str:
     """Return the reference with the highest score, and whether it is above the model's."""
-    references = entry.get("references", {})
-    if not references:
+    if (name := best_reference(entry)) is None:
         return ""
-    name = max(references, key=lambda one: references[one]["mean"])
-    above = " (higher)" if references[name]["mean"] > entry["mean"] else ""
-    return f"{name}: {_estimate(references[name])}{above}"
+    reference = entry["references"][name]
+    above = " (higher)" if reference["mean"] > entry["mean"] else ""
+    return f"{name}: {_estimate(reference)}{above}"
 
 
 def _table(header: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> str:

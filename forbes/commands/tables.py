@@ -12,7 +12,7 @@ from rich.table import Table
 from forbes.commands.console import console
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.metrics import EvaluatedRun, Pair, at_horizons, degradation
-from forbes.evaluation.references import lowest_above
+from forbes.evaluation.references import best_reference, lowest_above
 
 __all__ = ["beaten_by", "print_degradation", "print_images", "print_pairs", "print_references"]
 __all__ += ["print_runs"]
@@ -58,12 +58,9 @@ def print_references(measured: Sequence[EvaluatedRun]) -> None:
 
 def _over_best(entry: Mapping[str, Any]) -> str:
     """Return the difference of a score to its best reference, with its name; nothing if it has none."""
-    references = entry.get("references")
-    if not references:
+    if (best := best_reference(entry)) is None:
         return ""
-    best = max(references, key=lambda name: references[name]["mean"])
-    difference = _estimate(references[best]["difference"])
-    return f"{difference.mean:+.2f} ± {difference.standard_error:.2f}\n({best})"
+    return f"{_signed(_estimate(entry['references'][best]['difference']))}\n({best})"
 
 
 def beaten_by(entry: Mapping[str, Any]) -> str | None:
@@ -173,7 +170,11 @@ def _estimate(entry: Mapping[str, float]) -> Estimate:
 
 
 def _difference(difference: Estimate) -> str:
-    return f"{difference.mean:+.2f} ± {difference.standard_error:.2f}\n({_ratio(difference)})"
+    return f"{_signed(difference)}\n({_ratio(difference)})"
+
+
+def _signed(difference: Estimate) -> str:
+    return f"{difference.mean:+.2f} ± {difference.standard_error:.2f}"
 
 
 def _ratio(difference: Estimate) -> str:

@@ -17,6 +17,7 @@ reference predicts worse than without a belief. Sequences of a known process are
 """
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,7 +27,7 @@ from forbes.evaluation.ngram import fit_ngrams
 from forbes.models import Likelihood, Normal, PartsLikelihood, SymlogNormal, VectorNormal
 from forbes.seeding import forked
 
-__all__ = ["lowest_above", "reference_means", "references"]
+__all__ = ["best_reference", "lowest_above", "reference_means", "references"]
 
 _EXAMPLES, _ROWS = 500, 50
 """Number of training sequences that are averaged and fitted, at equal distances, and that are decoded at a time."""
@@ -56,6 +57,12 @@ def lowest_above(score: float, means: Mapping[str, float]) -> str | None:
     """Return the name of the lowest reference above a score, or None if there is none above it."""
     above = [(mean, name) for name, mean in means.items() if mean > score]
     return min(above)[1] if above else None
+
+
+def best_reference(entry: Mapping[str, Any]) -> str | None:
+    """Return the name of the highest reference of an entry of `evaluation.json`, or None if it has none."""
+    found: Mapping[str, Any] = entry.get("references", {})
+    return max(found, key=lambda name: found[name]["mean"], default=None)
 
 
 def _is_gaussian(likelihood: Likelihood) -> bool:
