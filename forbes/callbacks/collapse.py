@@ -32,9 +32,10 @@ class WarnOfCollapse(Callback):
         first, update = self._first
         if value < first and not self._warned and trainer.is_global_zero:
             self._warned = True
+            best = "; checkpoints/best.ckpt has its best" if trainer.checkpoint_callback else ""
             print(
                 f"forbes: {metric} is {value:.1f}, below the {first:.1f} of update {update}: the training may have "
-                "collapsed. Lower --model.learning_rate or --model.clip_norm; checkpoints/best.ckpt has its best",
+                f"collapsed. Lower --model.learning_rate or --model.clip_norm{best}",
                 file=sys.stderr,
                 flush=True,
             )

@@ -30,6 +30,7 @@ from forbes.figures.style import (
     method_styles,
     method_title,
     paper_style,
+    task_title,
 )
 
 __all__ = ["PAPER_TASKS", "draw_layers", "draw_returns", "draw_returns_1m", "draw_trajectories", "draw_trajectories_n"]
@@ -253,7 +254,7 @@ def _draw_published(axes: Axes, task: str, end: float) -> None:
 
 
 def _label_panel(axes: Axes, task: str, end: float, empty: bool) -> None:
-    axes.set_title(task.rpartition(":")[2])  # gymnasium:popgym:popgym-X-v0 is too wide
+    axes.set_title(task_title(task))
     axes.set_xlim(0, 1.02 * end)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
     axes.locator_params("x", nbins=5)

@@ -161,9 +161,12 @@ def draw_bands(bands: Sequence[Sequence[Panel | Bars]], width: float = PAGE) -> 
 
 
 def _wrapped(title: str, width: float) -> str:
-    """Break a title into lines of at most `width` inches, after spaces and between the parts of a path."""
+    """Break a title into lines of at most `width` inches, after spaces and between the parts of a path.
+
+    Equations such as `t = 30` stay on one line.
+    """
     lines = [""]
-    for part in re.findall(r"[^ /_-]*[ /_-]+|[^ /_-]+", title):
+    for part in re.findall(r"(?: = |[^ /_-])+[ /_-]*|[ /_-]+", title):
         longer = lines[-1] + part
         points = TextPath((0, 0), longer.rstrip(), rcParams["axes.titlesize"]).get_extents().width
         if lines[-1] and points > 72 * width:

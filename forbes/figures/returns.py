@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from forbes.figures.style import BLACK, COLUMN, GREY, draw_range, method_styles, method_title, paper_style
+from forbes.figures.style import BLACK, COLUMN, GREY, draw_range, method_styles, method_title, paper_style, task_title
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,7 +48,7 @@ def join_seeds(curves: "Sequence[pd.Series]") -> "pd.DataFrame":
 
 
 def _label(axes: Axes, task: str, end: float) -> None:
-    axes.set(xlabel="env steps (frames)", ylabel="return per episode", title=task.rpartition(":")[2])
+    axes.set(xlabel="env steps (frames)", ylabel="return per episode", title=task_title(task))
     axes.set_xlim(0, 1.02 * end)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k, 1M
     axes.locator_params("x", nbins=6)

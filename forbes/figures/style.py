@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["BLACK", "BLUE", "COLUMN", "GREEN", "GREY", "METHODS", "ORANGE", "PAGE", "PALETTE", "Method"]
 __all__ += ["density_map", "draw_range", "draw_references", "method_styles", "method_title", "paper_style"]
-__all__ += ["save_figure", "save_png_and_pdf", "show_settled"]
+__all__ += ["save_figure", "save_png_and_pdf", "show_settled", "task_title"]
 
 COLUMN, PAGE = 3.3, 6.9
 """Widths in inches: one column and the whole page."""
@@ -93,6 +93,11 @@ def method_title(name: str) -> str:
         return name
     plain = _plain(name)
     return (method + plain[_matched(method, plain) :]).strip()
+
+
+def task_title(task: str) -> str:
+    """Return the title of a task, which is its last part: `gymnasium:popgym:popgym-X-v0` is popgym-X-v0."""
+    return task.rpartition(":")[2]
 
 
 def method_styles(names: Sequence[str]) -> dict[str, Method]:

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from lightning.pytorch.callbacks import Checkpoint
 
 from forbes.callbacks.collapse import WarnOfCollapse
 from forbes.commands.cli import main
@@ -11,12 +12,17 @@ from forbes.commands.cli import main
 BOUND = "val/elbo[bernoulli,S=1]"
 
 
-def warned(capsys, *values, **others):
+def warned(capsys, *values, saving=True, **others):
     """What is printed for these validation bounds, one after each epoch."""
     callback, module = WarnOfCollapse(), SimpleNamespace(objective_name="elbo[bernoulli,S=1]")
     for number, value in enumerate(values, start=1):
         metrics = {BOUND: torch.tensor(value)} | others
-        trainer = SimpleNamespace(callback_metrics=metrics, global_step=500 * number, is_global_zero=True)
+        trainer = SimpleNamespace(
+            callback_metrics=metrics,
+            global_step=500 * number,
+            is_global_zero=True,
+            checkpoint_callback=Checkpoint() if saving else None,
+        )
         callback.on_train_epoch_end(trainer, module)
     return capsys.readouterr().err
 
@@ -32,6 +38,11 @@ def test_a_bound_below_the_first_is_reported_once_with_both_values_and_what_to_d
     assert line.count("\n") == 1
     assert f"{BOUND} is -219.5, below the -50.0 of update 500" in line
     assert "Lower --model.learning_rate or --model.clip_norm" in line
+
+
+@pytest.mark.parametrize("saving", [True, False])
+def test_the_best_checkpoint_is_named_only_where_one_is_saved(capsys, saving):
+    assert ("checkpoints/best.ckpt has its best" in warned(capsys, -50.0, -219.5, saving=saving)) == saving
 
 
 def test_the_bounds_of_an_agent_are_not_compared(capsys):

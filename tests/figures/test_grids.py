@@ -65,6 +65,16 @@ def test_long_titles_are_broken_into_lines_that_overlap_neither_each_other_nor_a
     ]
 
 
+@pytest.mark.parametrize("width", [2.5, 2.0, 1.5])
+def test_an_equation_in_a_title_stays_on_one_line(width):
+    panels = [Panel(title, frames(1, 2, channels=1), "black") for title in ("predictions after t = 30", "truth")]
+
+    title = draw_panels(panels, width).axes[0].get_title()
+
+    assert "\n" in title
+    assert "t = 30" in title
+
+
 @CHANNELS
 def test_imagination_is_drawn(channels):
     truth = frames(2, 5, channels=channels)
