@@ -57,7 +57,8 @@ class ElboCurve(PictureCallback):
             if has_kl:
                 _draw_steps(axes[3], *self._kl_per_step(module, data), colour)
             draw_references(axes[0], self._references(module, data))
-            axes[0].legend()
+            if axes[0].get_legend_handles_labels()[0]:
+                axes[0].legend()
         return figure
 
     def _references(self, module: WorldModel, data: SequenceDataModule) -> dict[str, float]:

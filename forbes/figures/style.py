@@ -209,7 +209,12 @@ def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", 
 
 
 def show_settled(axes: Axes, curves: "Sequence[pd.Series]") -> None:
-    """Set the y limits of an axis of curves to the range after their first quarter, in which they change fast."""
+    """Set the y limits of an axis of curves to the range after their first quarter, in which they change fast.
+
+    Without curves, as of a training without validation and shorter than the first logged update, they stay.
+    """
+    if not curves:
+        return
     first = 0.25 * max(curve.index.max() for curve in curves)
     settled = [value for curve in curves for value in curve[curve.index >= first]]
     margin = 0.05 * (max(settled) - min(settled)) + 1e-6

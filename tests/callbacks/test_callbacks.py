@@ -86,6 +86,14 @@ def test_every_family_and_likelihood_is_drawn(arguments, tiny_config, callbacks,
     assert all(is_picture(tmp_path / "figures" / name) for name in PICTURES)
 
 
+def test_a_training_without_a_metric_is_drawn_too(tiny_config, callbacks, tmp_path):
+    configs = ["--config", str(tiny_config), "--config", str(callbacks)]
+    without = ["--trainer.limit_val_batches", "0", "--trainer.log_every_n_steps", "1000"]
+    assert main(["fit", *configs, "--run_dir", str(tmp_path), *without]) == 0
+    assert not [name for name in read_metrics(tmp_path) if name.startswith(("train/", "val/"))]
+    assert all(is_picture(tmp_path / "figures" / name) for name in PICTURES)
+
+
 def test_a_model_without_a_state_has_all_but_the_belief_plot(tiny_config, callbacks, tmp_path, capsys):
     flags = ["--config", str(tiny_config), "--model.model", "VectorModel", "--model.state_dim", "0"]
     assert main(["fit", *flags, "--config", str(callbacks), "--run_dir", str(tmp_path / "refused")]) == 2
