@@ -1,7 +1,12 @@
 r"""Monotone rational-quadratic splines (Durkan et al., 2019, arXiv 1906.04032; Gregory and Delbourgo, 1982).
 
-A spline is an increasing map of the interval [-5, 5] to itself through K + 1 knots, and the identity outside. Unlike
-an affine coupling, it can split one mode into several, even in one dimension.
+A spline is an increasing map of the interval [-5, 5] to itself through K + 1 knots. Outside it goes on as a straight
+line, with its slope at the last knot. Unlike an affine coupling, it can split one mode into several, even in one
+dimension.
+
+The slopes of the two lines are learned. Durkan et al. hold them at 1, so that the slope may have to turn from 1 to e⁻³
+within a narrow outer bin. There the log-density has derivatives in the thousands, and a training can collapse: states
+gather at the edge, one update throws them out of the box, and no gradient of the spline leads back.
 """
 
 import torch
@@ -17,14 +22,14 @@ __all__ = ["SplineCoupling", "knot_table", "spline", "spline_inverse"]
 
 BOUND = 5.0
 """B, half the side of the box: a standard normal sample is outside with probability 6e-7."""
-MIN_WIDTH = 1e-3
-"""The smallest width of a bin, as a fraction of the box's side."""
+LOG_WIDTH_BOUND = 1.0
+"""Bound of |a|: the bins' widths differ by factors below e^2, so that 8 bins are between 0.19 and 5.1 wide."""
 LOG_MEAN_BOUND = 1.5
 """Bound of |v|: the bins' mean slopes differ by factors below e^3 and stay within e^±3."""
 LOG_SLOPE_BOUND = 1.0
 """Bound of |u|: the slope at an inner knot stays within a factor e^±1 of the harmonic mean of its two bins' slopes."""
-LOG_SLOPES = -5.5, 4.0
-"""Bounds of the log-slope everywhere, in nats; the lower one belongs to a flat bin at the edge, where the slope is 1.
+LOG_SLOPES = -4.22, 4.0
+"""Bounds of the log-slope everywhere, in nats.
 
 An inverse in float32 loses as many digits as the slope has leading zeros. With independent heights, as in Durkan et
 al., log-slopes reach -16, and float32 has no digits left.
@@ -32,32 +37,37 @@ al., log-slopes reach -16, and float32 has no digits left.
 
 
 def knot_table(raw: Tensor) -> Tensor:
-    r"""Return the bins of splines, `(*, 6, K)`, from unconstrained numbers, `(*, 3 K - 1)`.
+    r"""Return the bins of splines, `(*, 6, K)`, from unconstrained numbers, `(*, 3 K + 1)`.
 
-    The first K numbers, a, give the widths; the next K, v, the mean slopes; the last K - 1, u, the inner knots' slopes:
+    The first K numbers, a, give the widths; the next K, v, the mean slopes; the last K + 1, u, the slopes at the knots:
 
-    .. math:: w = 10\,\mathrm{softmax}(a), \quad
+    .. math:: w = 10\,\mathrm{softmax}(\tanh a), \quad
               s_k = \frac{10\,e^{1.5 \tanh(v_k / 1.5)}}{\sum_j w_j\,e^{1.5 \tanh(v_j / 1.5)}}, \quad h = s\,w, \quad
               d_k = \frac{2\,s_{k-1} s_k}{s_{k-1} + s_k}\,e^{\tanh u_k}
 
-    Each width is at least 1e-3 of the side. The slope is 1 at both ends. All zeros give the identity. Unlike
-    independent heights (Durkan et al.), these bound the slope inside a bin as well (`LOG_SLOPES`).
+    At either end, where a bin has one neighbour only, :math:`d_k = s_k e^{\tanh u_k}`. All zeros give the
+    identity. Unlike independent heights (Durkan et al.), these bound the slope inside a bin as well (`LOG_SLOPES`).
 
     Returns:
         Rows: left edge, lower edge, width, height, slope at the left edge and at the right one.
     """
-    bins = (raw.shape[-1] + 1) // 3
-    of_width, of_mean, of_slope = raw.split((bins, bins, bins - 1), -1)
-    width = MIN_WIDTH + (1 - bins * MIN_WIDTH) * of_width.softmax(-1)  # fractions of the side, (*, K)
-    mean = (LOG_MEAN_BOUND * (of_mean / LOG_MEAN_BOUND).tanh()).exp()  # (*, K)
+    bins = raw.shape[-1] // 3
+    of_width, of_mean, of_slope = raw.split((bins, bins, bins + 1), -1)
+    width = _bounded(of_width, LOG_WIDTH_BOUND).softmax(-1)  # fractions of the side, (*, K)
+    mean = _bounded(of_mean, LOG_MEAN_BOUND).exp()  # (*, K)
     mean = mean / (width * mean).sum(-1, keepdim=True)  # the heights add up to the side, too
     sizes = 2 * BOUND * torch.stack((width, width * mean), -2)  # (*, 2, K)
     edges = pad(sizes[..., :-1], (1, 0), value=-BOUND).cumsum(-1)  # (*, 2, K)
-    before, after = mean[..., :-1], mean[..., 1:]
-    harmonic = 2 * before * after / (before + after)  # (*, K - 1)
-    slope = harmonic * (LOG_SLOPE_BOUND * (of_slope / LOG_SLOPE_BOUND).tanh()).exp()  # (*, K - 1)
-    slopes = torch.stack((pad(slope, (1, 0), value=1.0), pad(slope, (0, 1), value=1.0)), -2)  # (*, 2, K)
+    before, after = torch.cat((mean[..., :1], mean), -1), torch.cat((mean, mean[..., -1:]), -1)  # 2 x (*, K + 1)
+    harmonic = 2 * before * after / (before + after)  # (*, K + 1)
+    slope = harmonic * _bounded(of_slope, LOG_SLOPE_BOUND).exp()  # (*, K + 1)
+    slopes = torch.stack((slope[..., :-1], slope[..., 1:]), -2)  # (*, 2, K)
     return torch.cat((edges, sizes, slopes), -2)  # (*, 6, K)
+
+
+def _bounded(value: Tensor, bound: float) -> Tensor:
+    """Return numbers within ±bound that are the values themselves near 0."""
+    return bound * (value / bound).tanh()
 
 
 def spline(x: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
@@ -73,13 +83,11 @@ def spline(x: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         y and :math:`\log \partial y / \partial x` in nats, both `(*)`.
     """
-    inside = x.clamp(-BOUND, BOUND)
-    left, lower, width, height, slope, next_slope = _bin_of(inside, table, edge=0)
-    xi, s = ((inside - left) / width).clamp(0, 1), height / width
+    left, lower, width, height, slope, next_slope = _bin_of(x, table, edge=0)
+    xi, s = ((x - left) / width).clamp(0, 1), height / width
     denominator, log_slope = _derivative(xi, s, slope, next_slope)
     y = lower + height * xi * (s * xi + slope * (1 - xi)) / denominator
-    # Outside the box the spline stays at its edge, where its slope is 1, and x - inside is added.
-    return y + (x - inside), log_slope
+    return y + _outside(x) * log_slope.exp(), log_slope
 
 
 def spline_inverse(y: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
@@ -96,19 +104,24 @@ def spline_inverse(y: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         x and :math:`\log \partial y / \partial x` at it in nats, both `(*)`.
     """
-    inside = y.clamp(-BOUND, BOUND)
-    left, lower, width, height, slope, next_slope = _bin_of(inside, table, edge=1)
-    eta, s = ((inside - lower) / height).clamp(0, 1), height / width  # so that rounding makes no square root imaginary
+    left, lower, width, height, slope, next_slope = _bin_of(y, table, edge=1)
+    eta, s = ((y - lower) / height).clamp(0, 1), height / width
     delta = slope * (1 - eta) - next_slope * eta
     first = delta > 0  # where the first form adds r and Δ
     total = (delta.square() + 4 * s.square() * eta * (1 - eta)).sqrt() + torch.where(first, delta, -delta)
     below, above = 2 * s * eta, 2 * s * (1 - eta)
     xi = torch.where(first, below / (below + total), total / (total + above))
-    return left + width * xi + (y - inside), _derivative(xi, s, slope, next_slope)[1]
+    log_slope = _derivative(xi, s, slope, next_slope)[1]
+    return left + width * xi + _outside(y) * (-log_slope).exp(), log_slope
+
+
+def _outside(value: Tensor) -> Tensor:
+    """Return how far a value is from the box, with its sign, `(*)`: what a line from the edge adds; 0 inside."""
+    return value - value.clamp(-BOUND, BOUND)
 
 
 def _bin_of(value: Tensor, table: Tensor, edge: int) -> tuple[Tensor, ...]:
-    """Return the six numbers, `(*)` each, of the bin that contains a value `(*)`: of x for edge 0, of y for edge 1."""
+    """Return the six numbers, `(*)` each, of a value's bin, or of the nearest: of x for edge 0, of y for edge 1."""
     index = (value[..., None] >= table[..., edge, 1:]).sum(-1)  # (*)
     table = table.expand(*index.shape, *table.shape[-2:])  # (*, 6, K)
     return table.gather(-1, index[..., None, None].expand(*index.shape, 6, 1)).squeeze(-1).unbind(-1)  # 6 x (*)
@@ -145,7 +158,7 @@ class SplineCoupling(Coupling):
         if bins < 2:
             raise ForbesError(f"SplineCoupling: bins is {bins}, expected at least 2; one bin is the identity")
         super().__init__(dim, width, swap)
-        self.table_of = nn.Linear(width, self.other * (3 * bins - 1))
+        self.table_of = nn.Linear(width, self.other * (3 * bins + 1))
         nn.init.zeros_(self.table_of.weight)
         nn.init.zeros_(self.table_of.bias)
 
@@ -168,13 +181,13 @@ class SplineCoupling(Coupling):
 
     def _table(self, x_a: Tensor, context_term: Tensor) -> Tensor:
         """Return the bins of x_b's splines, `(*, other, 6, K)`."""
-        raw = self.table_of(self.hidden(x_a, context_term))  # (*, other (3 K - 1))
+        raw = self.table_of(self.hidden(x_a, context_term))  # (*, other (3 K + 1))
         return knot_table(raw.unflatten(-1, (self.other, -1)))
 
 
 @fused
 def _transform(raw: Tensor, x: Tensor, given: int, swap: bool) -> tuple[Tensor, Tensor]:
-    """Return y, `(*, D)`, and the log-slopes of x_b, from raw numbers of its splines, `(*, other (3 K - 1))`."""
+    """Return y, `(*, D)`, and the log-slopes of x_b, from raw numbers of its splines, `(*, other (3 K + 1))`."""
     x_a, x_b = split(x, given, swap)
     y_b, log_slope = spline(x_b, knot_table(raw.unflatten(-1, (x_b.shape[-1], -1))))  # 2 x (*, other)
     return join(x_a, y_b, swap), log_slope
