@@ -4,9 +4,10 @@ A spline is an increasing map of the interval [-5, 5] to itself through K + 1 kn
 line, with its slope at the last knot. Unlike an affine coupling, it can split one mode into several, even in one
 dimension.
 
-The slopes of the two lines are learned. Durkan et al. hold them at 1, so that the slope may have to turn from 1 to e⁻³
-within a narrow outer bin. There the log-density has derivatives in the thousands, and a training can collapse: states
-gather at the edge, one update throws them out of the box, and no gradient of the spline leads back.
+Durkan et al. hold the slope at 1 at both ends, and let widths differ by any factor. A spline that shifts its input then
+squeezes bins against an end. A sample in a bin that is narrow and turns has a log-density with a derivative in the
+thousands, and trainings collapse (`docs/results/strokes-tried.md`). So here the slopes at the ends are learned, and no
+bin is more than e² times as wide as another.
 """
 
 import torch

@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from forbes.beliefs import FlowBelief
-from forbes.beliefs.splines import BOUND, LOG_SLOPES, LOG_WIDTH_BOUND, SplineCoupling, knot_table, spline, spline_inverse
+from forbes.beliefs.splines import (
+    BOUND,
+    LOG_SLOPES,
+    LOG_WIDTH_BOUND,
+    SplineCoupling,
+    knot_table,
+    spline,
+    spline_inverse,
+)
 from forbes.errors import ForbesError
 
 CONTEXT = 3
@@ -105,7 +113,9 @@ def test_what_left_the_box_is_still_led_by_the_knots(direction):
 
     y, log_slope = direction(torch.tensor([-7.0, 7.0], dtype=torch.float64), knot_table(raw))
 
-    assert all((torch.autograd.grad(v.sum(), raw, retain_graph=True)[0].norm(dim=-1) > 0.1).all() for v in (y, log_slope))
+    assert all(
+        (torch.autograd.grad(v.sum(), raw, retain_graph=True)[0].norm(dim=-1) > 0.1).all() for v in (y, log_slope)
+    )
 
 
 @pytest.mark.parametrize("scale", [1, 100])
