@@ -28,7 +28,7 @@ LOG_WIDTH_BOUND = 1.0
 LOG_MEAN_BOUND = 1.5
 """Bound of |v|: the bins' mean slopes differ by factors below e^3 and stay within e^±3."""
 LOG_SLOPE_BOUND = 1.0
-"""Bound of |u|: the slope at an inner knot stays within a factor e^±1 of the harmonic mean of its two bins' slopes."""
+"""Bound of |u|: the slope at a knot stays within a factor e^±1 of the harmonic mean of its bins' slopes."""
 LOG_SLOPES = -4.22, 4.0
 """Bounds of the log-slope everywhere, in nats.
 
@@ -106,7 +106,7 @@ def spline_inverse(y: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
         x and :math:`\log \partial y / \partial x` at it in nats, both `(*)`.
     """
     left, lower, width, height, slope, next_slope = _bin_of(y, table, edge=1)
-    eta, s = ((y - lower) / height).clamp(0, 1), height / width
+    eta, s = ((y - lower) / height).clamp(0, 1), height / width  # so that rounding makes no square root imaginary
     delta = slope * (1 - eta) - next_slope * eta
     first = delta > 0  # where the first form adds r and Δ
     total = (delta.square() + 4 * s.square() * eta * (1 - eta)).sqrt() + torch.where(first, delta, -delta)

@@ -107,6 +107,16 @@ def test_beyond_the_box_it_is_a_line_with_the_slope_of_its_edge(direction):
 
 
 @pytest.mark.parametrize("direction", [spline, spline_inverse])
+def test_gradients_are_finite_beyond_the_box_and_at_its_edge(direction):
+    raw = (3 * normal(6, 25)).requires_grad_()
+    x = torch.tensor([-1e6, -7.0, -BOUND, BOUND, 7.0, 1e6], dtype=torch.float64, requires_grad=True)
+
+    y, log_slope = direction(x, knot_table(raw))
+
+    assert all(by.isfinite().all() for by in torch.autograd.grad((y + log_slope).sum(), (x, raw)))
+
+
+@pytest.mark.parametrize("direction", [spline, spline_inverse])
 def test_what_left_the_box_is_still_led_by_the_knots(direction):
     """Where the spline is the identity outside, it has no gradient there, and a state that left does not come back."""
     raw = normal(2, 25).requires_grad_()
