@@ -85,7 +85,7 @@ def _write(args: Any, record: dict[str, Any], studies: Sequence[Study]) -> None:
     curves = [
         {"row": row.name, "c": one.prefixes.context, "best": row.best, "average": row.average}
         for one in studies
-        for row in (*one.runs, one.similar, one.truth)
+        for row in one.completed
     ]
     content = json.dumps(record | {"scores": found, "curves": curves}, indent=2)
     replace_file(args.output / "completions.json", f"{content}\n".encode())
@@ -132,15 +132,9 @@ def _print(study: Study, length: int) -> None:
         "average[end]": f"error of the\naverage of {study.samples}",
     }
     screen = console(160)
-    screen.print(
-        _table(
-            study,
-            f"{title}: their classes, nats",
-            of_classes,
-            [*study.runs, study.reference, study.similar, study.truth],
-        )
-    )
-    screen.print(_table(study, f"{title}: their pixels", of_pixels, [*study.runs, study.similar, study.truth]))
+    rows = [*study.completed, study.reference]
+    screen.print(_table(study, f"{title}: their classes, nats", of_classes, rows))
+    screen.print(_table(study, f"{title}: their pixels", of_pixels, study.completed))
 
 
 def _table(study: Study, title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> Table:

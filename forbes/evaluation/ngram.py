@@ -1,4 +1,4 @@
-r"""n-grams of pen moves: the log-likelihood of digit strokes under a model without images.
+r"""n-grams of pen moves: log-likelihoods and completions of digit strokes by a model without images.
 
 A move m_t leads from one pixel of the pen's path to the next: to one of its 8 neighbours, or by a jump to any pixel x.
 
@@ -12,10 +12,12 @@ A move m_t leads from one pixel of the pen's path to the next: to one of its 8 n
 N are counts in the training split, c' is the context c without its earliest move, and :math:`\alpha = 5`. First pixels
 :math:`p_1` and targets of jumps :math:`p_J` are empirical, with :math:`\alpha` pseudo-counts spread over all pixels.
 The path determines the frames, so this is a lower bound of their log-probability: a model of frames with a lower score
-has not learned how a pen moves.
+has not learned how a pen moves. Paths that are drawn stay in the image; moves that would leave it are not drawn.
 """
 
+from collections.abc import Iterator
 from functools import lru_cache
+from itertools import islice
 from typing import NamedTuple
 
 import torch
@@ -31,6 +33,8 @@ ORDERS = (1, 2, 3, 4, 5)
 _JUMP, _START, _SYMBOLS = 8, 9, 10
 """Moves are 0 to 7, or a jump; a context may also contain the start of the path."""
 _PSEUDO_COUNTS = 5.0
+_STEPS = torch.tensor([(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if (dx, dy) != (0, 0)])
+"""(dx, dy) of the moves 0 to 7, int64 `(8, 2)`."""
 
 
 class _Moves(NamedTuple):
@@ -69,16 +73,50 @@ class NGrams:
         pixel, move, valid = self._moves(split, count)
         begins, jumps = move == _START, move == _JUMP
         log_pixel = self.first[pixel] * begins + self.target[pixel] * jumps  # (N, P)
-        probability = torch.full_like(log_pixel, 1 / (_JUMP + 1))  # (N, P)
         index = move.clamp(max=_JUMP)[..., None]
         by_order = {}
-        for order, counts in enumerate(self.counts):
-            of_context = counts[_context(move, order)]  # (N, P, 9)
-            of_move = of_context.gather(-1, index)[..., 0]  # (N, P)
-            probability = (of_move + _PSEUDO_COUNTS * probability) / (of_context.sum(-1) + _PSEUDO_COUNTS)
-            log_prob = (log_pixel + probability.log() * ~begins) * valid  # (N, P)
+        for order, probability in enumerate(self._probabilities(move)):
+            log_move = probability.gather(-1, index)[..., 0].log()  # (N, P)
+            log_prob = (log_pixel + log_move * ~begins) * valid  # (N, P)
             by_order[order] = log_prob.unflatten(1, (self.length, -1)).sum(-1)  # (N, T)
         return {order: by_order[order] for order in ORDERS}
+
+    def complete(self, points: Tensor, count: int, order: int) -> Tensor:
+        """Draw more points of each path.
+
+        Args:
+            points: the first P points (x, y) of each path, uint8 `(B, P, 2)`.
+            count: number of points to draw.
+            order: order n, at most 5.
+
+        Returns:
+            The whole paths, uint8 `(B, P + count, 2)`.
+        """
+        for _ in range(count):
+            points = torch.cat((points, self._next(points, order)[:, None]), 1)  # (B, P + 1, 2)
+        return points
+
+    def _next(self, points: Tensor, order: int) -> Tensor:
+        """Draw the next point of each path, `(B, P, 2)` to uint8 `(B, 2)`."""
+        last = points[:, -1:]  # (B, 1, 2)
+        number = torch.full((len(points),), points.shape[1] + 1)
+        move = _moves(StrokePoints(torch.cat((points, last), 1), number)).move  # (B, P + 1), with one yet to be drawn
+        probability = next(islice(self._probabilities(move), order, None))[:, -1]  # (B, 9)
+        jump = self.target.exp().multinomial(len(points), replacement=True)  # (B,)
+        jump = torch.stack((jump % SIDE, jump // SIDE), -1)  # (B, 2)
+        options = torch.cat((last + _STEPS, jump[:, None]), 1)  # (B, 9, 2)
+        inside = ((options >= 0) & (options < SIDE)).all(-1)  # (B, 9)
+        drawn = (probability * inside).multinomial(1)  # (B, 1)
+        return options.take_along_dim(drawn[..., None], 1)[:, 0].to(torch.uint8)  # (B, 2)
+
+    def _probabilities(self, move: Tensor) -> Iterator[Tensor]:
+        """Yield p_n of all moves at each place of a path, float64 `(B, P, 9)`, for orders 0 to 5."""
+        probability = torch.full((*move.shape, _JUMP + 1), 1 / (_JUMP + 1), dtype=torch.float64)
+        for order, counts in enumerate(self.counts):
+            of_context = counts[_context(move, order)]  # (B, P, 9)
+            total = of_context.sum(-1, keepdim=True)
+            probability = (of_context + _PSEUDO_COUNTS * probability) / (total + _PSEUDO_COUNTS)
+            yield probability
 
     def _moves(self, split: Split, count: int) -> _Moves:
         points, number = self.source.gather(split, torch.arange(count), self.length)

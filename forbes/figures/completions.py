@@ -29,12 +29,12 @@ _SIDE_BY_SIDE = 2
 """Number of models next to each other; further models are drawn below."""
 _LEGEND = 5  # entries per line
 _SCORES = {  # scores of the class, with the rows for comparison
-    "js[end]": ("JS to the reference, nats", ("similar",)),
-    "entropy[end]": ("entropy of the class, nats", ("similar", "reference")),
-    "nll[end]": ("−log p of the label, nats", ("similar", "reference")),
-    "clear[end]": ("fraction of clear digits", ("similar", "truth")),
+    "js[end]": ("JS to the reference, nats", ("ngram", "similar")),
+    "entropy[end]": ("entropy of the class, nats", ("ngram", "similar", "reference")),
+    "nll[end]": ("−log p of the label, nats", ("ngram", "similar", "reference")),
+    "clear[end]": ("fraction of clear digits", ("ngram", "similar", "truth")),
 }
-_LINES = {"similar": ":", "reference": "--", "truth": "-."}
+_LINES = {"ngram": "-", "similar": ":", "reference": "--", "truth": "-."}
 
 
 def by_ambiguity(reference: Tensor, count: int) -> Tensor:

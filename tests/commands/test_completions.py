@@ -84,6 +84,7 @@ def test_the_same_command_gives_the_same_numbers(completed, runs, tmp_path, caps
     for words in (
         "12 digits, 2 steps seen, 4 completions",
         "reference",
+        "5-gram",
         "true digits",
         "similar digits",
         "FORBES − RSSM",

@@ -11,6 +11,8 @@ from forbes.data import Strokes
 from forbes.evaluation.ngram import ORDERS, NGrams, fit_ngrams
 
 LENGTH = 6
+P001 = 26.12
+"""What a χ² of 8 degrees of freedom exceeds with a probability of 0.001."""
 NEIGHBOURS = [(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if (x, y) != (0, 0)]
 
 
@@ -19,9 +21,9 @@ def source_fixture(strokes_file):
     return Strokes(path=str(strokes_file), validation=20)
 
 
-def paths_of(source, split):
-    """Pixels of every digit, cut at LENGTH."""
-    points, number = source.gather(split, torch.arange(source.size(split)), LENGTH)
+def paths_of(source, split, length=LENGTH):
+    """Pixels of every digit, cut at a length."""
+    points, number = source.gather(split, torch.arange(source.size(split)), length)
     return [[(int(x), int(y)) for x, y in path[:n]] for path, n in zip(points, number, strict=True)]
 
 
@@ -34,24 +36,32 @@ def smoothed(count, total, prior):
     return (count + 5 * prior) / (total + 5)
 
 
-def log_prob_slowly(train, path, order):
-    """The formula of the module, with counts in dictionaries."""
-    first = Counter(training[0] for training in train)
-    jumps = Counter(p for t in train for p, move in zip(t[1:], moves_of(t), strict=True) if move == "jump")
-    total = math.log(smoothed(first[path[0]], len(train), 1 / 784))
+def move_probabilities(train, path, order):
+    """The probability of each move after a path by the formula of the module, with counts in dictionaries."""
     moves = ["start"] * order + moves_of(path)
-    for place, move in enumerate(moves[order:], start=order):
-        probability = 1 / 9
-        for n in range(order + 1):
-            context = tuple(moves[place - n : place])
-            seen = Counter()
-            for training in train:
-                known = ["start"] * n + moves_of(training)
-                seen.update(known[t] for t in range(n, len(known)) if tuple(known[t - n : t]) == context)
-            probability = smoothed(seen[move], seen.total(), probability)
-        total += math.log(probability)
+    found = dict.fromkeys([*range(8), "jump"], 1 / 9)
+    for n in range(order + 1):
+        context = tuple(moves[len(moves) - n :])
+        seen = Counter()
+        for training in train:
+            known = ["start"] * n + moves_of(training)
+            seen.update(known[t] for t in range(n, len(known)) if tuple(known[t - n : t]) == context)
+        found = {move: smoothed(seen[move], seen.total(), prior) for move, prior in found.items()}
+    return found
+
+
+def jump_probability(train, pixel):
+    jumps = Counter(p for t in train for p, move in zip(t[1:], moves_of(t), strict=True) if move == "jump")
+    return smoothed(jumps[pixel], jumps.total(), 1 / 784)
+
+
+def log_prob_slowly(train, path, order):
+    first = Counter(training[0] for training in train)
+    total = math.log(smoothed(first[path[0]], len(train), 1 / 784))
+    for place, move in enumerate(moves_of(path), start=1):
+        total += math.log(move_probabilities(train, path[:place], order)[move])
         if move == "jump":
-            total += math.log(smoothed(jumps[path[place - order + 1]], jumps.total(), 1 / 784))
+            total += math.log(jump_probability(train, path[place]))
     return total
 
 
@@ -72,6 +82,46 @@ def test_a_step_of_several_points_adds_up_their_log_probs(source):
 
     for order in ORDERS:
         torch.testing.assert_close(one[order].unflatten(1, (3, 2)).sum(-1), two[order])
+
+
+def probabilities_seen(train, path, order):
+    """The probability of each move as one sees it: a jump that lands on a neighbour is a move there."""
+    found = move_probabilities(train, path, order)
+    (x, y), jump = path[-1], found["jump"]
+    landed = {k: jump * jump_probability(train, (x + dx, y + dy)) for k, (dx, dy) in enumerate(NEIGHBOURS)}
+    return {move: found[move] + landed[move] for move in range(8)} | {"jump": jump - sum(landed.values())}
+
+
+@pytest.mark.parametrize("order", [0, 1, 3])
+def test_points_are_drawn_with_the_probabilities_of_the_formula(order):
+    source = Strokes(validation=59_900)  # a training split of 100 digits
+    train = paths_of(source, "train", 30)
+    path = paths_of(source, "test", 10)[0]
+    expected, *others = (probabilities_seen(train, path, n) for n in (order, *({0, 1, 3} - {order})))
+    assert sum(expected.values()) == pytest.approx(1)
+    count = 20_000
+    torch.manual_seed(0)
+
+    drawn = NGrams(source, 30).complete(torch.tensor([path] * count, dtype=torch.uint8), 1, order)
+
+    found = Counter(moves_of([path[-1], tuple(point)])[0] for point in drawn[:, -1].tolist())
+
+    def chi_square(probabilities):
+        return sum((found[move] - count * p) ** 2 / (count * p) for move, p in probabilities.items())
+
+    assert chi_square(expected) < P001 < min(map(chi_square, others))
+
+
+def test_what_is_drawn_begins_as_given_and_stays_in_the_image(source):
+    corners = torch.tensor([[[0, 0]], [[27, 0]], [[0, 27]], [[27, 27]]], dtype=torch.uint8)
+    torch.manual_seed(0)
+
+    drawn = NGrams(source, LENGTH).complete(corners.repeat(50, 1, 1), 8, 2)
+
+    assert drawn.shape == (200, 9, 2)
+    assert drawn.dtype == torch.uint8
+    assert torch.equal(drawn[:, :1], corners.repeat(50, 1, 1))
+    assert drawn.max() < 28
 
 
 def test_padding_counts_nothing(source):

@@ -25,10 +25,10 @@ Completions are classified at the step at which the true digit ends, since model
   grey ink      fraction of the ink with a grey value between 0.1 and 0.9
   error         squared error in pixels: of one completion, of the best of N, and of the average image of N
 
-Two rows are for comparison: similar digits, the N training digits with the most similar beginnings, in place of
-completions; and the true digits, a bound for the scores of single completions, without diversity. Writes
-completions.json and .csv, and figures, including drawings for each prefix length. A run takes about 80 seconds per
-hundred digits on one core."""
+Three rows are for comparison: completions by a 5-gram of pen moves, which has seen no image; similar digits, the N
+training digits with the most similar beginnings, in place of completions; and the true digits, a bound for the scores
+of single completions, without diversity. Writes completions.json and .csv, and figures, including drawings for each
+prefix length. A run takes about 80 seconds per hundred digits on one core."""
 
 
 def parser() -> RunsParser:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceData, Split, Strokes
 from forbes.data.strokes.classifiers import DigitClassifier, DigitClassifiers
+from forbes.data.strokes.source import StrokePoints
 from forbes.errors import ForbesError
 from forbes.evaluation.digits.neighbours import TrainingPrefixes, mean_frame
 from forbes.evaluation.digits.scores import (
@@ -31,6 +32,7 @@ from forbes.evaluation.digits.scores import (
     jensen_shannon,
     ratio_values,
 )
+from forbes.evaluation.ngram import ORDERS, fit_ngrams
 from forbes.evaluation.predictions import complete
 from forbes.evaluation.scores import Increments
 from forbes.evaluation.scoring import Scorer
@@ -41,6 +43,7 @@ __all__ = [
     "classes_at",
     "model_scorer",
     "neighbour_scorer",
+    "ngram_scorer",
     "score_completions",
     "select_prefixes",
     "summarise",
@@ -76,9 +79,13 @@ class Prefixes(NamedTuple):
     """Class probabilities given the prefix, r(y | o_1:c), float64 (B, 10)."""
 
     def batches(self, data: SequenceData, split: Split) -> Iterator[tuple[int, SequenceBatch]]:
-        """Yield the whole digits in batches, with the position of the first."""
+        """Yield the whole digits in batches, with the position of the first. The state of a step is its points."""
+        assert isinstance(data.source, Strokes)
+        longest = int(self.steps.max())
         for rows in torch.arange(len(self.digits)).split(_ROWS):
-            yield int(rows[0]), data.sequences(split, self.digits[rows], int(self.steps.max()))
+            points = data.source.gather(split, self.digits[rows], longest).points  # (B, T * points_per_step, 2)
+            state = points.reshape(len(rows), longest, -1)  # (B, T, 2 * points_per_step)
+            yield int(rows[0]), data.sequences(split, self.digits[rows], longest)._replace(state=state)
 
 
 def select_prefixes(
@@ -146,6 +153,23 @@ def neighbour_scorer(data: SequenceData, context: int, samples: int, classifiers
         nearest = training.nearest(batch.observation[:, :context], samples)  # (B, N)
         others = data.sequences("train", nearest.T.flatten(), batch.observation.shape[1]).observation
         frames = data.source.pictures(others)[:, context:].float().unflatten(0, (-1, len(nearest)))  # (N, B, T - c, …)
+        return score_completions(frames, batch, context, data.length, classifiers)
+
+    return Scorer(_READINGS, f"c={context},N={samples}", function, _ROWS)
+
+
+def ngram_scorer(data: SequenceData, context: int, samples: int, classifiers: DigitClassifiers) -> Scorer:
+    """Return the scorer of N completions by the n-gram of the highest order, a model that has not seen an image."""
+    assert isinstance(data.source, Strokes)
+    source, ngrams = data.source, fit_ngrams(data.source, data.length)
+
+    def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
+        batch = _pictures(data, _to_the_end(batch))
+        steps = batch.mask.shape[1]
+        seen = batch.state[:, :context].reshape(len(batch.mask), -1, 2).repeat(samples, 1, 1)  # (N B, P, 2)
+        points = ngrams.complete(seen, (steps - context) * source.points_per_step, max(ORDERS))
+        drawn = source.decode(StrokePoints(points, torch.full((len(points),), points.shape[1]))).observation
+        frames = source.pictures(drawn)[:, context:].float().unflatten(0, (samples, -1))  # (N, B, T - c, 1, H, W)
         return score_completions(frames, batch, context, data.length, classifiers)
 
     return Scorer(_READINGS, f"c={context},N={samples}", function, _ROWS)

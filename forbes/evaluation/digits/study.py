@@ -12,11 +12,13 @@ from forbes.evaluation.digits.completions import (
     Prefixes,
     model_scorer,
     neighbour_scorer,
+    ngram_scorer,
     summarise,
     summarise_classes,
     truth_scorer,
 )
 from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.ngram import ORDERS
 from forbes.evaluation.runs import TrainedRun
 from forbes.evaluation.scoring import Scorer, score_split, with_progress
 
@@ -50,10 +52,17 @@ class Study(NamedTuple):
     reference: Row
     """Scores of the prefix classifier."""
     runs: list[Row]
+    ngram: Row
+    """Scores of completions by n-grams of pen moves. A model below them does not draw better than without images."""
     similar: Row
     """Scores of the training digits with the most similar beginnings, as completions."""
     truth: Row
     """Scores of the true digits, as completions."""
+
+    @property
+    def completed(self) -> list[Row]:
+        """All rows but the reference."""
+        return [*self.runs, self.ngram, self.similar, self.truth]
 
     @property
     def differences(self) -> list[tuple[Row, Row, dict[str, Estimate]]]:
@@ -102,6 +111,7 @@ def study(
         samples,
         Row("reference", None, summarise_classes(classes, prefixes), error, classes),
         [measure(name, run.path, run, scorer) for name, run in runs.items()],
+        measure(f"{max(ORDERS)}-gram", None, first, ngram_scorer(data, context, samples, classifiers)),
         measure("similar digits", None, first, neighbour_scorer(data, context, samples, classifiers)),
         measure("true digits", None, first, truth_scorer(data, context, classifiers)),
     )
@@ -120,7 +130,7 @@ def entries(study: Study, digits: str) -> list[dict[str, Any]]:
         return f"{digits}/" + score.replace("[", f"[c={context},N={study.samples},")
 
     found: list[dict[str, Any]] = []
-    for row in (*study.runs, study.reference, study.similar, study.truth):
+    for row in (*study.completed, study.reference):
         head: dict[str, Any] = {"row": row.name, "run": row.path, "minus": None}
         found += [head | {"metric": name(score), **_entry(Estimate.of(each))} for score, each in row.scores.items()]
         found.append(head | {"metric": name("ece[end]"), "mean": row.calibration, "standard_error": None})

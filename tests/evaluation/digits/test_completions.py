@@ -1,5 +1,7 @@
 """What is read of completions: of the truth, of one class only, of a blur, and of a digit that becomes another."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.digits.completions import (
     model_scorer,
     neighbour_scorer,
+    ngram_scorer,
     score_completions,
     select_prefixes,
     summarise,
@@ -217,15 +220,32 @@ def test_similar_digits_stand_in_for_completions(model, data, prefixes, classifi
     assert readings["grey"].abs().max() == 0
 
 
+@pytest.mark.parametrize("points_per_step", [1, 2])
+def test_an_ngram_draws_on_from_what_was_seen(model, classifiers, points_per_step):
+    data = SequenceDataModule(Strokes(points_per_step=points_per_step, frames="written"), length=LENGTH)
+    few = select_prefixes(data, "test", 6, CONTEXT, classifiers.prefix)
+    shorter = few._replace(steps=few.steps.clamp(max=CONTEXT + 1))  # of which one step is drawn
+
+    def readings(prefixes):
+        scorer = ngram_scorer(data, CONTEXT, 20, classifiers)
+        return summarise(score_split(model, prefixes.batches(data, "test"), scorer).values, prefixes, LENGTH)
+
+    whole, one_step = readings(few), readings(shorter)
+    assert whole["grey[end]"].abs().max() == 0
+    assert one_step["error[end]"].max() <= 2 * points_per_step  # so many pixels are not those of the truth
+    assert 0 < one_step["error[end]"].mean() < whole["error[end]"].mean()
+
+
 def test_written_strokes_are_read_as_whole_frames_are(model, data, prefixes, classifiers):
     written = SequenceDataModule(Strokes(frames="written"), length=LENGTH)
 
     few, same = (select_prefixes(each, "test", 3, CONTEXT, classifiers.prefix) for each in (data, written))
 
     assert torch.equal(few.reference, same.reference)
-    for one in (truth_scorer, lambda data, *rest: neighbour_scorer(data, CONTEXT, 2, classifiers)):
+    drawn = (partial(scorer, samples=2) for scorer in (neighbour_scorer, ngram_scorer))
+    for one in (truth_scorer, *drawn):
         whole, added = (
-            score_split(model, few.batches(each, "test"), one(each, CONTEXT, classifiers)).values
+            score_split(model, few.batches(each, "test"), one(each, CONTEXT, classifiers=classifiers)).values
             for each in (data, written)
         )
         assert all(torch.equal(added[name], values) for name, values in whole.items())
