@@ -34,7 +34,12 @@ _SCORES = {  # scores of the class, with the rows for comparison
     "nll[end]": ("−log p of the label, nats", ("ngram", "similar", "reference")),
     "clear[end]": ("fraction of clear digits", ("ngram", "similar", "truth")),
 }
-_LINES = {"ngram": "-", "similar": ":", "reference": "--", "truth": "-."}
+_BESIDE = {
+    "ngram": Method(GREY, "-", "x"),
+    "similar": Method(GREY, ":", "."),
+    "reference": Method(GREY, "--", "."),
+    "truth": Method(GREY, "-.", "."),
+}
 
 
 def by_ambiguity(reference: Tensor, count: int) -> Tensor:
@@ -100,7 +105,7 @@ def draw_class_scores(studies: Sequence[Study]) -> Figure:
                 _draw_line(axes, studies, [one.runs[number] for one in studies], score, style)
             for name in beside:
                 rows = [getattr(one, name) for one in studies]
-                _draw_line(axes, studies, rows, score, Method(GREY, _LINES[name], "."))
+                _draw_line(axes, studies, rows, score, _BESIDE[name])
             axes.set(title=title, xlabel="steps seen", xticks=[one.prefixes.context for one in studies])
             axes.set_ylim(bottom=0)
             labelled |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
