@@ -38,7 +38,7 @@ _BESIDE = {
     "ngram": Method(GREY, "-", "x"),
     "similar": Method(GREY, ":", "."),
     "reference": Method(GREY, "--", "."),
-    "truth": Method(GREY, "-.", "."),
+    "truth": Method(GREY, (0, (3, 1, 1, 1)), "."),  # "-." looks solid in a legend: the marker hides its dot
 }
 
 

@@ -84,7 +84,7 @@ class Prefixes(NamedTuple):
         longest = int(self.steps.max())
         for rows in torch.arange(len(self.digits)).split(_ROWS):
             points = data.source.gather(split, self.digits[rows], longest).points  # (B, T * points_per_step, 2)
-            state = points.reshape(len(rows), longest, -1)  # (B, T, 2 * points_per_step)
+            state = points.reshape(len(rows), longest, -1).float()  # (B, T, 2 * points_per_step)
             yield int(rows[0]), data.sequences(split, self.digits[rows], longest)._replace(state=state)
 
 
@@ -166,7 +166,8 @@ def ngram_scorer(data: SequenceData, context: int, samples: int, classifiers: Di
     def function(model: BeliefModel, batch: SequenceBatch) -> Increments:
         batch = _pictures(data, _to_the_end(batch))
         steps = batch.mask.shape[1]
-        seen = batch.state[:, :context].reshape(len(batch.mask), -1, 2).repeat(samples, 1, 1)  # (N B, P, 2)
+        seen = batch.state[:, :context].to(torch.uint8).reshape(len(batch.mask), -1, 2)  # (B, P, 2)
+        seen = seen.repeat(samples, 1, 1)  # (N B, P, 2)
         points = ngrams.complete(seen, (steps - context) * source.points_per_step, max(ORDERS))
         drawn = source.decode(StrokePoints(points, torch.full((len(points),), points.shape[1]))).observation
         frames = source.pictures(drawn)[:, context:].float().unflatten(0, (samples, -1))  # (N, B, T - c, 1, H, W)
