@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,21 +19,21 @@ from forbes.runs.naming import with_suffix, without_seed
 from forbes.runs.worlds import LoadedWorld, is_world, open_world
 
 __all__ = ["TrainedRun", "data_name", "data_sha256", "find_device", "load_runs", "method_name", "model_name"]
-__all__ += ["is_agent", "open_model", "require_comparable", "run_titles", "split_batches"]
+__all__ += ["is_agent", "open_model", "recorded_runs", "require_comparable", "run_titles", "split_batches"]
 
 _PUBLISHED: dict[type[nn.Module], str] = {GaussianBelief: "RSSM", FlowBelief: "FORBES"}
 """Published names of the models whose name differs from their class."""
 
 
 class TrainedRun(NamedTuple):
-    """A run folder and the model loaded from it."""
+    """A run folder and its model."""
 
     path: str
     """Path as the user typed it."""
     model: BeliefModel
     data: SequenceData
-    checkpoint: str
-    """SHA-256 of the checkpoint that the model was loaded from."""
+    checkpoint: str | None
+    """SHA-256 of the checkpoint that the model was loaded from; None for a model of `recorded_runs` without one."""
     config: dict[str, Any]
     """Sections `model` and `data` of config.yaml without seeds: equal for runs that differ only in the seed."""
 
@@ -103,9 +103,31 @@ def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
     runs = []
     for path in paths:
         model, data, config, checkpoint = open_model(path)
-        sections = {key: without_seed(config[key]) for key in ("model", "data")}
-        runs.append(TrainedRun(path, model.to(device), data, checkpoint, sections))
+        runs.append(TrainedRun(path, model.to(device), data, checkpoint, _sections(config)))
     return runs
+
+
+def recorded_runs(paths: Sequence[str]) -> list[TrainedRun]:
+    """Return runs for what their folders have recorded, which needs no weights.
+
+    A folder without a checkpoint is drawn too: before its first one, or after it was deleted. Its model is untrained.
+    """
+    runs = []
+    for path in paths:
+        folder = RunFolder.existing(path)
+        if folder.config.is_file() and not folder.checkpoint.is_file() and folder.results == folder.path:
+            from forbes.runs.modules import build_module  # these import Lightning
+            from forbes.training.world_model import WorldModel
+
+            module, data, config = build_module(folder, WorldModel, "forbes beliefs")
+            runs.append(TrainedRun(path, module.model, data, None, _sections(config)))
+        else:
+            runs += load_runs([path])
+    return runs
+
+
+def _sections(config: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: without_seed(config[key]) for key in ("model", "data")}
 
 
 def is_agent(run: str) -> bool:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from matplotlib.figure import Figure
 
 from forbes.evaluation.references import reference_means
-from forbes.evaluation.runs import load_runs
+from forbes.evaluation.runs import recorded_runs
 from forbes.figures.families import group, require_same_data
 from forbes.figures.style import COLUMN, Method, draw_range, draw_references, paper_style, show_settled
 
@@ -35,7 +35,7 @@ def draw_elbo(runs: Sequence[str]) -> dict[str, Figure]:
     Raises:
         ForbesError: if the runs are of different data, or one has no validation yet.
     """
-    trained = load_runs(runs)
+    trained = recorded_runs(runs)
     require_same_data(trained)
     data = trained[0].data
     count = min(data.validation_sequences, data.source.size("validation"))
@@ -59,16 +59,18 @@ def elbo_against_updates(families: Sequence[FamilyCurves], references: Mapping[s
     with paper_style():
         figure = Figure((COLUMN, 2.3), layout="constrained")
         axes = figure.subplots()
+        shown = [curve for family in families for curve in family.curves]
         for family in families:
             table = pd.concat(family.curves, axis=1).dropna()  # updates common to all runs
             draw_range(axes, table, family.style, family.label + (f", {family.bound}" if len(bounds) > 1 else ""))
             if family.tests:
-                test = sum(family.tests) / len(family.tests)
-                (end,) = axes.plot(table.index.max(), test, "D", color=family.style.colour, markersize=5, zorder=3)
-                end.set(markeredgecolor="white", clip_on=False)
+                end = pd.Series([sum(family.tests) / len(family.tests)], [table.index.max()])
+                (diamond,) = axes.plot(end, "D", color=family.style.colour, markersize=5, zorder=3)
+                diamond.set(markeredgecolor="white", clip_on=False)
+                shown.append(end)
         if any(family.tests for family in families):
             axes.plot([], [], "D", color="none", markeredgecolor="black", markersize=4, label="final test")
-        show_settled(axes, [curve for family in families for curve in family.curves])
+        show_settled(axes, shown)
         draw_references(axes, references)
         if len(bounds) == 1:
             title = bounds.pop().replace("elbo", "ELBO")

@@ -1,7 +1,7 @@
 """Group runs into families, and read what their folders have recorded."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from forbes.errors import ForbesError
 from forbes.evaluation.methods import by_configuration
@@ -14,7 +14,7 @@ from forbes.runs.folder import read_metrics
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["RunFamily", "group", "require_same_data"]
+__all__ = ["RunFamily", "group", "recorded_entries", "require_same_data"]
 
 _COMPARED = 500
 """Number of test sequences that must be the same for all runs."""
@@ -64,6 +64,12 @@ def require_same_data(runs: Sequence[TrainedRun]) -> None:
     require_comparable(runs, [data_sha256(run.data, "test", count) for run, count in zip(runs, counts, strict=True)])
 
 
+def recorded_entries(run: TrainedRun) -> dict[str, dict[str, Any]]:
+    """Return the entries of `evaluation.json` of this checkpoint, or all of them where the run has none."""
+    entries = read_record(run.path)
+    return {name: entry for name, entry in entries.items() if run.checkpoint in (None, entry.get("checkpoint"))}
+
+
 def _curve(run: TrainedRun) -> "pd.Series":
     metrics = read_metrics(run.path)
     name = f"val/{run.model.bound_name}"
@@ -75,7 +81,5 @@ def _curve(run: TrainedRun) -> "pd.Series":
 def _test_elbo(run: TrainedRun) -> float | None:
     if not run.model.bound_name.startswith("elbo["):
         return None
-    entries = {
-        name: entry for name, entry in read_record(run.path).items() if entry.get("checkpoint") == run.checkpoint
-    }
-    return next((entry["mean"] for name, entry in entries.items() if name.startswith("test/elbo[")), None)
+    entries = recorded_entries(run).items()
+    return next((entry["mean"] for name, entry in entries if name.startswith("test/elbo[")), None)

@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 
 from forbes.errors import ForbesError
 from forbes.evaluation.metrics import score_of
-from forbes.evaluation.record import read_record
-from forbes.evaluation.runs import TrainedRun, load_runs
-from forbes.figures.families import RunFamily, group, require_same_data
+from forbes.evaluation.runs import TrainedRun, recorded_runs
+from forbes.figures.families import RunFamily, group, recorded_entries, require_same_data
 from forbes.figures.style import BLACK, PAGE, draw_range, draw_references, paper_style
 
 __all__ = ["draw_per_step", "draw_prequential"]
@@ -80,18 +79,15 @@ def draw_prequential(runs: Sequence[str]) -> dict[str, Figure]:
 
 
 def _families(runs: Sequence[str]) -> list[RunFamily]:
-    trained = load_runs(runs)
+    trained = recorded_runs(runs)
     require_same_data(trained)
     return group(trained)
 
 
 def _entries(run: TrainedRun) -> dict[str, dict[str, Any]]:
     """Return the recorded entries of this checkpoint that have a curve over steps."""
-    return {
-        name: entry
-        for name, entry in read_record(run.path).items()
-        if entry.get("checkpoint") == run.checkpoint and {"mean", "standard_error", "curve", "data"} <= entry.keys()
-    }
+    fields = {"mean", "standard_error", "curve", "data"}
+    return {name: entry for name, entry in recorded_entries(run).items() if fields <= entry.keys()}
 
 
 def _common(families: Sequence[RunFamily], score: str) -> str:

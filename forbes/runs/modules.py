@@ -15,7 +15,7 @@ from forbes.runs.folder import RunFolder, read_config
 from forbes.runs.hyperparameters import build_arguments, plain_arguments
 from forbes.runs.worlds import check_weights, instantiate, put, weights_of
 
-__all__ = ["LoadedRun", "build_data", "build_run", "load_module", "open_module"]
+__all__ = ["LoadedRun", "build_data", "build_module", "build_run", "load_module", "open_module"]
 
 Module = TypeVar("Module", bound=LightningModule)
 
@@ -73,13 +73,25 @@ def open_module(run: Path | str, kind: type[Module], other: str, changes: Mappin
     folder = RunFolder.trained(run)
     checkpoint = open_checkpoint(folder.checkpoint)
     state = weights_of(checkpoint.content, str(folder.checkpoint))
-    module, data, config = build_run(folder, changes)
-    if not isinstance(module, kind):
-        found = type(module).__name__
-        raise ForbesError(f"{run}: a run of {found}, expected one of {kind.__name__}. Use instead: {other} {run}")
+    module, data, config = build_module(folder, kind, other, changes)
     check_weights(module, state, str(folder.checkpoint))
     module.load_state_dict(state)
     return LoadedRun(module.eval(), data, config, checkpoint.sha256)
+
+
+def build_module(
+    folder: RunFolder, kind: type[Module], other: str, changes: Mapping[str, Any] = {}
+) -> tuple[Module, SequenceDataModule, dict[str, Any]]:
+    """Build the module of a run, with untrained weights, as `build_run`.
+
+    Raises:
+        ForbesError: if the module is of another class; `other` is the command for it.
+    """
+    module, data, config = build_run(folder, changes)
+    if not isinstance(module, kind):
+        found = type(module).__name__
+        raise ForbesError(f"{folder}: a run of {found}, expected one of {kind.__name__}. Use instead: {other} {folder}")
+    return module, data, config
 
 
 def build_run(

@@ -134,6 +134,8 @@ def test_what_cannot_be_measured_is_one_sentence(run, tiny_run, tmp_path, capsys
     mixed = shutil.copytree(run, tmp_path / "mixed")
     config = mixed / "config.yaml"
     config.write_text(config.read_text().replace("observation_std: 1.5", "observation_std: 1.25", 1))
+    bare = shutil.copytree(run, tmp_path / "bare")
+    shutil.rmtree(bare / "checkpoints")
     few = ["--sequences", "12"]
 
     for arguments, sentence in [
@@ -144,6 +146,10 @@ def test_what_cannot_be_measured_is_one_sentence(run, tiny_run, tmp_path, capsys
         (
             ["evaluate", run],
             f"{run}: a run of KnownBelief, expected one of WorldModel. Use instead: forbes beliefs",
+        ),
+        (
+            ["figures", "elbo", "--runs", bare],
+            f"{bare}: a run of KnownBelief, expected one of WorldModel. Use instead: forbes beliefs",
         ),
         (["beliefs", run], f"--sequences 200: the test split of {run} has 12, expected 2 to 12"),
         (["beliefs", run, "--sequences", "1"], "--sequences 1: "),

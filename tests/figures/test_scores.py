@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from forbes.commands.cli import main
 from forbes.evaluation.runs import load_runs
+from forbes.figures.catalogue import draw
 from forbes.figures.scores import draw_per_step, draw_prequential
 from forbes.figures.style import METHODS
 
@@ -111,3 +112,22 @@ def test_scores_of_other_data_or_checkpoints_are_refused(record, capsys, tmp_pat
         assert "evaluation.json has no pll of this checkpoint" in sentence
         assert f"Run: forbes evaluate {first} {other}" in sentence
     assert not (tmp_path / "figures").exists()
+
+
+@pytest.mark.parametrize("figure", ["elbo", "per-step", "prequential"])
+def test_what_is_recorded_is_drawn_without_checkpoints(figure, record, tmp_path):
+    scores = {"elbo": [-50.0, -40.0], "reconstruction": [-1.0, 0.0], "kl": [2.0, 1.0], "pll": [-2.5, -1.0]}
+    runs = [record(0, "forbes-0", **scores), record(1, "rssm-0", **scores)]
+    drawn = [path.read_bytes() for path in draw(figure, runs, tmp_path / "with")]
+
+    for run in runs:
+        shutil.rmtree(Path(run) / "checkpoints")
+
+    assert [path.read_bytes() for path in draw(figure, runs, tmp_path / "without")] == drawn
+
+
+def test_a_named_checkpoint_must_exist_for_a_figure_of_records(record, capsys, tmp_path):
+    run = record(0, "forbes-0", pll=[-3.0, -1.0])
+    missing = f"{run}/checkpoints/worst.ckpt"
+    sentence = error_of(capsys, "figures", "prequential", "-o", tmp_path / "figures", "--runs", missing)
+    assert sentence.startswith(f"{missing}: no such checkpoint. There are ")

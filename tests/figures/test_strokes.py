@@ -93,12 +93,13 @@ def test_a_family_curve_is_the_mean_and_ends_in_the_test_elbo(runs, tmp_path):
 
     (axes,) = draw_elbo(copies)["elbo"].axes
 
-    forbes, marker, rssm, _ = axes.lines
+    forbes, marker, rssm, *_ = axes.lines
     curves = [read_metrics(run)["val/elbo[bernoulli,S=1]"].dropna() for run in runs]
     assert list(forbes.get_xdata()) == [5, 10]
     assert forbes.get_ydata() == pytest.approx((curves[0] + curves[1]) / 2)
     assert rssm.get_ydata() == pytest.approx(curves[2])
-    assert (marker.get_xdata(), marker.get_ydata()) == (10, -95.0)
+    assert (*marker.get_xdata(), *marker.get_ydata()) == (10, -95.0)
+    assert axes.get_ylim()[0] < -95.0 < axes.get_ylim()[1]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [
         "FORBES, 2 runs",
         "RSSM",

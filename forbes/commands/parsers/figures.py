@@ -16,6 +16,7 @@ Draw a figure of the paper from run folders, as PNG and PDF. It may be given by 
 
 Runs that differ only in the seed form a family. It is drawn as the mean and range over its runs; predictions are those
 of the first. A family trained with another bound than the ELBO is drawn with that bound, as the legend states.
+elbo, per-step and prequential draw what a run has recorded; its checkpoints may be gone.
 
 The digits of Figure 4, unless given by --index, are the most ambiguous of each class among the first 500 test digits,
 by the labels of the 50 nearest training digits. The choice does not depend on any model."""
