@@ -144,7 +144,8 @@ def draw_errors(studies: Sequence[Study]) -> Figure:
         figure = Figure((PAGE, 2.3), layout="constrained")
         panels = figure.subplots(1, len(studies), squeeze=False, sharey=True)[0]
         for axes, study in zip(panels, studies, strict=True):
-            rows = [*zip(study.runs, _styles(study), strict=True), (study.similar, Method(GREY))]
+            rows = [*zip(study.runs, _styles(study), strict=True)]
+            rows += [(study.ngram, _BESIDE["ngram"]), (study.similar, _BESIDE["similar"])]
             for row, style in rows:
                 number = np.arange(1, len(row.best) + 1)
                 marks = {"marker": style.marker, "markevery": (0.05, 0.2), "markersize": 3}  # dashes are averages
