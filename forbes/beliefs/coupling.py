@@ -17,7 +17,7 @@ from forbes.errors import ForbesError
 from forbes.performance.flow_loop import CouplingLayers, FlowStep, affine_layers, prepare_flow
 from forbes.performance.time_loop import TimeLoop
 
-__all__ = ["AffineCoupling", "ConditionalFlow", "Coupling", "CouplingFamily", "LULinear", "join", "split"]
+__all__ = ["AffineCoupling", "ConditionalFlow", "Coupling", "CouplingFamily", "LULinear", "bounded", "join", "split"]
 
 LOG_SCALE_BOUND = 2.0
 """|ℓ| stays below this in each layer: a plain exp explodes (nflows issue 49), a sigmoid could only contract."""
@@ -137,6 +137,11 @@ def join(x_a: Tensor, x_b: Tensor, swap: bool) -> Tensor:
     return torch.cat((x_b, x_a) if swap else (x_a, x_b), -1)
 
 
+def bounded(value: Tensor, bound: float) -> Tensor:
+    """Return numbers within ±bound that are the values themselves near 0."""
+    return bound * (value / bound).tanh()
+
+
 class AffineCoupling(Coupling):
     r"""Affine coupling: :math:`y_a = x_a` and :math:`y_b = x_b \odot e^{\ell} + t`, :math:`(\ell, t) = NN(x_a, c)`.
 
@@ -181,7 +186,7 @@ class AffineCoupling(Coupling):
     def _network(self, x_a: Tensor, context_term: Tensor) -> tuple[Tensor, Tensor]:
         """Return (ℓ, t) = NN(x_a, c), `(*, other)` each."""
         u = self.hidden(x_a, context_term)
-        log_scale = LOG_SCALE_BOUND * torch.tanh(self.log_scale(u) / LOG_SCALE_BOUND)
+        log_scale = bounded(self.log_scale(u), LOG_SCALE_BOUND)
         return log_scale, self.shift(u)
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from forbes.beliefs.coupling import Coupling, join, split
+from forbes.beliefs.coupling import Coupling, bounded, join, split
 from forbes.errors import ForbesError
 from forbes.performance.flow_loop import CouplingLayers
 from forbes.performance.fusion import fused
@@ -54,21 +54,16 @@ def knot_table(raw: Tensor) -> Tensor:
     """
     bins = raw.shape[-1] // 3
     of_width, of_mean, of_slope = raw.split((bins, bins, bins + 1), -1)
-    width = _bounded(of_width, LOG_WIDTH_BOUND).softmax(-1)  # fractions of the side, (*, K)
-    mean = _bounded(of_mean, LOG_MEAN_BOUND).exp()  # (*, K)
+    width = bounded(of_width, LOG_WIDTH_BOUND).softmax(-1)  # fractions of the side, (*, K)
+    mean = bounded(of_mean, LOG_MEAN_BOUND).exp()  # (*, K)
     mean = mean / (width * mean).sum(-1, keepdim=True)  # the heights add up to the side, too
     sizes = 2 * BOUND * torch.stack((width, width * mean), -2)  # (*, 2, K)
     edges = pad(sizes[..., :-1], (1, 0), value=-BOUND).cumsum(-1)  # (*, 2, K)
     before, after = torch.cat((mean[..., :1], mean), -1), torch.cat((mean, mean[..., -1:]), -1)  # 2 x (*, K + 1)
     harmonic = 2 * before * after / (before + after)  # (*, K + 1)
-    slope = harmonic * _bounded(of_slope, LOG_SLOPE_BOUND).exp()  # (*, K + 1)
+    slope = harmonic * bounded(of_slope, LOG_SLOPE_BOUND).exp()  # (*, K + 1)
     slopes = torch.stack((slope[..., :-1], slope[..., 1:]), -2)  # (*, 2, K)
     return torch.cat((edges, sizes, slopes), -2)  # (*, 6, K)
-
-
-def _bounded(value: Tensor, bound: float) -> Tensor:
-    """Return numbers within ±bound that are the values themselves near 0."""
-    return bound * (value / bound).tanh()
 
 
 def spline(x: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
