@@ -78,5 +78,5 @@ def elbo_against_updates(families: Sequence[FamilyCurves], references: Mapping[s
         else:
             title = "bound"
             figure.legend(loc="outside upper center")  # the names of the bounds would cover the curves
-        axes.set(xlabel="updates", ylabel=f"validation {title}\nnats per sequence")
+        axes.set(xlabel="updates", ylabel=f"{title}\nvalidation, nats per sequence")
     return figure

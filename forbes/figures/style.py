@@ -183,29 +183,37 @@ def draw_range(axes: Axes, runs: "pd.DataFrame", method: Method, label: str) -> 
 
 
 def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", "y"] = "y") -> bool:
-    """Draw a dotted line at each mean on a score axis, and return whether there is one.
+    """Draw a dotted line at each mean on a score axis, and return whether there is one, or a label.
 
-    Means that are outside the axis by more than its extent are omitted. The axis is extended to the others, and the
-    highest one is labelled. Along x the label is at the right of the line, in the lowest quarter of the axes.
+    The axis is extended to means that are outside it by less than its extent. The highest line is labelled, and the
+    highest mean that is too far above for a line is written with an arrow. Along x the labels are in the lowest quarter
+    of the axes.
     """
     low, high = axes.get_ylim() if along == "y" else axes.get_xlim()
     near = {name: mean for name, mean in means.items() if 2 * low - high < mean < 2 * high - low}
-    if not near:
-        return False
+    above = {name: mean for name, mean in means.items() if mean >= 2 * high - low}
     for mean in near.values():
         (axes.axhline if along == "y" else axes.axvline)(mean, color=GREY, ls=":", lw=0.8)
-    low, high = min(low, *near.values()), max(high, *near.values())
-    limits = low - 0.03 * (high - low), high + 0.08 * (high - low)  # with room for the label
-    best = max(near, key=lambda name: near[name])
-    if along == "y":
-        axes.set_ylim(*limits)
-        at_edge = axes.get_yaxis_transform()
-        axes.text(0.01, near[best], best, transform=at_edge, fontsize=6, color=GREY, va="bottom")
-    else:
-        axes.set_xlim(*limits)
-        at_edge = axes.get_xaxis_transform()
-        axes.text(near[best], 0.03, best, transform=at_edge, fontsize=6, color=GREY, ha="left", rotation=90)
-    return True
+    if near:
+        low, high = min(low, *near.values()), max(high, *near.values())
+        limits = low - 0.03 * (high - low), high + 0.08 * (high - low)  # with room for the label
+        best = max(near, key=lambda name: near[name])
+        if along == "y":
+            axes.set_ylim(*limits)
+            at_edge = axes.get_yaxis_transform()
+            axes.text(0.01, near[best], best, transform=at_edge, fontsize=6, color=GREY, va="bottom")
+        else:
+            axes.set_xlim(*limits)
+            at_edge = axes.get_xaxis_transform()
+            axes.text(near[best], 0.03, best, transform=at_edge, fontsize=6, color=GREY, ha="left", rotation=90)
+    if above:
+        best = max(above, key=lambda name: above[name])
+        label = f"{best} {above[best]:.1f}".replace(" -", " −")
+        if along == "y":
+            axes.text(0.01, 0.99, f"↑ {label}", transform=axes.transAxes, fontsize=6, color=GREY, va="top")
+        else:
+            axes.text(0.99, 0.03, f"{label} →", transform=axes.transAxes, fontsize=6, color=GREY, ha="right")
+    return bool(near or above)
 
 
 def show_settled(axes: Axes, curves: "Sequence[pd.Series]") -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from forbes.commands.cli import main
@@ -18,7 +19,7 @@ from forbes.figures.elbo import FamilyCurves, draw_elbo, elbo_against_updates
 from forbes.figures.families import group
 from forbes.figures.grids import Panel, draw_panels
 from forbes.figures.predictions import ambiguous_digits
-from forbes.figures.style import BLACK, BLUE, METHODS, ORANGE, paper_style, save_figure
+from forbes.figures.style import BLACK, BLUE, METHODS, ORANGE, draw_references, paper_style, save_figure
 from forbes.runs.folder import read_metrics
 
 RSSM = ["--model.init_args.belief", "GaussianBelief"]
@@ -110,9 +111,25 @@ def test_a_family_curve_is_the_mean_and_ends_in_the_test_elbo(runs, tmp_path):
 def test_a_family_is_drawn_where_all_its_runs_have_values():
     curves = [pd.Series([-3.0, -2.0, -1.0], [10, 20, 30]), pd.Series([-5.0, -4.0], [10, 20])]
     (axes,) = elbo_against_updates([FamilyCurves("A", METHODS["FORBES"], "elbo[S=1]", curves, [])], {}).axes
-    assert axes.get_ylabel() == "validation ELBO[S=1]\nnats per sequence"
+    assert axes.get_ylabel() == "ELBO[S=1]\nvalidation, nats per sequence"
     assert list(axes.lines[0].get_xdata()) == [10, 20]
     assert list(axes.lines[0].get_ydata()) == [-4.0, -3.0]
+
+
+def test_a_reference_far_above_the_curves_is_written():
+    curves = [pd.Series([-5.0, -4.0, -3.0], [10, 20, 30])]
+    family = FamilyCurves("A", METHODS["FORBES"], "elbo[S=1]", curves, [])
+    figure = elbo_against_updates([family], {"mean frame": -900.0, "1-gram": -3.5, "last frame": 900.0})
+
+    assert [text.get_text() for text in figure.axes[0].texts] == ["1-gram", "↑ last frame 900.0"]
+    assert max(figure.axes[0].get_ylim()) < 0
+
+    axes = Figure().subplots()
+    axes.set_xlim(-5.0, -3.0)
+    assert draw_references(axes, {"mean frame": -900.0, "last frame": -0.5}, along="x")
+    assert not draw_references(axes, {"mean frame": -900.0}, along="x")
+    assert [text.get_text() for text in axes.texts] == ["last frame −0.5 →"]
+    assert axes.get_xlim() == (-5.0, -3.0)
 
 
 def test_families_of_other_bounds_are_drawn_by_their_own(runs, tiny_config, tmp_path):
@@ -126,7 +143,7 @@ def test_families_of_other_bounds_are_drawn_by_their_own(runs, tiny_config, tmp_
     figure = draw_elbo([runs[0], particle, vector])["elbo"]
 
     (axes,), (legend,) = figure.axes, figure.legends
-    assert axes.get_ylabel() == "validation bound\nnats per sequence"
+    assert axes.get_ylabel() == "bound\nvalidation, nats per sequence"
     assert [text.get_text() for text in legend.get_texts()] == [
         "FORBES, elbo[bernoulli,S=1]",
         "Particle, fivo[bernoulli,K=2]",
