@@ -122,7 +122,7 @@ def recorded_runs(paths: Sequence[str]) -> list[TrainedRun]:
             module, data, config = build_module(folder, WorldModel, "forbes beliefs")
             runs.append(TrainedRun(path, module.model, data, None, _sections(config)))
         else:
-            runs += load_runs([path])
+            runs += load_runs([path])  # which refuses what is no run, and a named checkpoint that is missing
     return runs
 
 

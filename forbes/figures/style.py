@@ -207,13 +207,18 @@ def draw_references(axes: Axes, means: Mapping[str, float], along: Literal["x", 
             at_edge = axes.get_xaxis_transform()
             axes.text(near[best], 0.03, best, transform=at_edge, fontsize=6, color=GREY, ha="left", rotation=90)
     if above:
-        best = max(above, key=lambda name: above[name])
-        label = f"{best} {above[best]:.1f}".replace(" -", " −")
-        if along == "y":
-            axes.text(0.01, 0.99, f"↑ {label}", transform=axes.transAxes, fontsize=6, color=GREY, va="top")
-        else:
-            axes.text(0.99, 0.03, f"{label} →", transform=axes.transAxes, fontsize=6, color=GREY, ha="right")
+        _name_above(axes, above, along)
     return bool(near or above)
+
+
+def _name_above(axes: Axes, means: Mapping[str, float], along: Literal["x", "y"]) -> None:
+    """Write the highest of the means that are above an axis, with an arrow."""
+    best = max(means, key=lambda name: means[name])
+    label = f"{best} {means[best]:.1f}".replace(" -", " −")
+    if along == "y":
+        axes.text(0.01, 0.99, f"↑ {label}", transform=axes.transAxes, fontsize=6, color=GREY, va="top")
+    else:
+        axes.text(0.99, 0.03, f"{label} →", transform=axes.transAxes, fontsize=6, color=GREY, ha="right")
 
 
 def show_settled(axes: Axes, curves: "Sequence[pd.Series]") -> None:
