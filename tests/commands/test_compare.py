@@ -266,8 +266,9 @@ def test_references_stand_below_the_table_and_in_the_picture(compared, families)
     lowest = min(names, key=means.__getitem__)
     (row,) = [line for line in text.splitlines() if line.startswith(f"| `{ELBO}` |") and "<" in line]
     assert row.count(f"< {lowest}") == 2  # hardly trained: below all of them
-    axes = draw_scores(comparison._replace(references={ELBO: {"near": -1e3, "far": 1e9}})).axes[0]
-    assert [text.get_text() for text in axes.texts if "near" in text.get_text() or "far" in text.get_text()] == []
+    axes = draw_scores(comparison._replace(references={ELBO: {"below": -1e9, "above": 1e9}})).axes[0]
+    labels = [text.get_text() for text in axes.texts]
+    assert "above 1000000000.0 →" in labels and not any("below" in label for label in labels)
 
 
 def test_a_run_that_was_trained_otherwise_is_refused_and_the_others_finish(configs, compared, tmp_path, capsys):
