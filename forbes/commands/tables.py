@@ -11,8 +11,8 @@ from rich.table import Table
 
 from forbes.commands.console import console
 from forbes.evaluation.estimates import Estimate
-from forbes.evaluation.metrics import EvaluatedRun, Pair, at_horizons, degradation
-from forbes.evaluation.references import best_reference, lowest_above
+from forbes.evaluation.metrics import EvaluatedRun, Pair, at_horizons, degradation, score_of
+from forbes.evaluation.references import best_reference, lowest_above, merge_equal
 
 __all__ = ["beaten_by", "print_degradation", "print_images", "print_pairs", "print_references"]
 __all__ += ["print_runs"]
@@ -35,20 +35,28 @@ def print_runs(measured: Sequence[EvaluatedRun]) -> None:
 
 def print_references(measured: Sequence[EvaluatedRun]) -> None:
     """Print the scores of the references on the same sequences, explain the marks of `print_runs`, and compare."""
-    columns: dict[str, dict[str, str]] = {}
-    for name, entry in itertools.chain.from_iterable(evaluated.entries.items() for evaluated in measured):
-        for reference, estimate in entry.get("references", {}).items():
-            columns.setdefault(reference, {})[name] = str(_estimate(estimate))
-    if not columns:
+    rows = {
+        name: {reference: str(_estimate(estimate)) for reference, estimate in entry["references"].items()}
+        for name, entry in itertools.chain.from_iterable(evaluated.entries.items() for evaluated in measured)
+        if entry.get("references")
+    }
+    if not rows:
         return
+    columns: dict[str, dict[str, str]] = {}
+    for names, row in merge_equal(rows).items():
+        for reference, cell in row.items():
+            columns.setdefault(reference, {})[names] = cell
     screen = console(200)
     _print(screen, "log p of the same steps under models without a belief, nats per sequence", columns)
-    below = [
-        evaluated.run.path for evaluated in measured if any(beaten_by(entry) for entry in evaluated.entries.values())
-    ]
-    if below:
-        text = f"<: below this reference, so the model has learned less than it: {escape(', '.join(below))}"
-        screen.print(text, soft_wrap=True)
+    below = {
+        evaluated.run.path: [score_of(name) for name, entry in evaluated.entries.items() if beaten_by(entry)]
+        for evaluated in measured
+    }
+    if named := ", ".join(f"{path} ({', '.join(scores)})" for path, scores in below.items() if scores):
+        text = (
+            f"<: below this reference: {named}. If its tightest score is, a model has learned less than the reference."
+        )
+        screen.print(escape(text), soft_wrap=True)
     differences = {
         str(number): {name: over for name, entry in evaluated.entries.items() if (over := _over_best(entry))}
         for number, evaluated in enumerate(measured, start=1)

@@ -18,7 +18,7 @@ from forbes.errors import ForbesError
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.metrics import SCORES, at_horizons, degradation, score_of
 from forbes.evaluation.record import read_arrays, read_record
-from forbes.evaluation.references import lowest_above
+from forbes.evaluation.references import lowest_above, merge_equal
 
 __all__ = ["Comparison", "Family", "compare", "markdown"]
 
@@ -165,7 +165,7 @@ def markdown(comparison: Comparison, families: Sequence[Family]) -> str:
         lines += ["", "Models without a belief on the same steps; <: the mean over seeds is below this one.", ""]
         of_references = next(iter(comparison.references.values()))
         lines += _table(["metric", *of_references], [])
-        for metric, means in comparison.references.items():
+        for metric, means in merge_equal(comparison.references).items():
             lines += _rows([[f"`{metric}`", *(f"{mean:.2f}" for mean in means.values())]])
     if len(comparison.differences):
         lines += ["", f"Paired over sequences, minus {names[0]}: mean ± standard error.", ""]

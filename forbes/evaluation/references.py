@@ -23,11 +23,12 @@ import torch
 from torch import Tensor
 
 from forbes.data import SequenceBatch, SequenceData, Simulated, Split, Strokes
+from forbes.evaluation.metrics import score_of
 from forbes.evaluation.ngram import fit_ngrams
 from forbes.models import Likelihood, Normal, PartsLikelihood, SymlogNormal, VectorNormal
 from forbes.seeding import forked
 
-__all__ = ["best_reference", "lowest_above", "reference_means", "references"]
+__all__ = ["best_reference", "lowest_above", "merge_equal", "reference_means", "references"]
 
 _EXAMPLES, _ROWS = 500, 50
 """Number of training sequences that are averaged and fitted, at equal distances, and that are decoded at a time."""
@@ -63,6 +64,22 @@ def best_reference(entry: Mapping[str, Any]) -> str | None:
     """Return the name of the highest reference of an entry of `evaluation.json`, or None if it has none."""
     found: Mapping[str, Any] = entry.get("references", {})
     return max(found, key=lambda name: found[name]["mean"], default=None)
+
+
+def merge_equal(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """Return the rows of metrics with one row for those that are equal, since references depend on the steps only.
+
+    `test[:20]/elbo[bernoulli,S=16]` and `test[:20]/pll[bernoulli,K=128]` become `test[:20]/elbo, pll`.
+    """
+    groups: dict[tuple[str, tuple[Any, ...]], list[str]] = {}
+    for metric, row in rows.items():
+        groups.setdefault((metric.partition("/")[0], tuple(row.items())), []).append(metric)
+    return {_joined(split, metrics): dict(row) for (split, row), metrics in groups.items()}
+
+
+def _joined(split: str, metrics: list[str]) -> str:
+    scores = ", ".join(dict.fromkeys(map(score_of, metrics)))
+    return metrics[0] if len(metrics) == 1 else f"{split}/{scores}"
 
 
 def _is_gaussian(likelihood: Likelihood) -> bool:

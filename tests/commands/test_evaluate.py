@@ -386,6 +386,7 @@ def test_every_score_stands_beside_its_references(runs, capsys):
             assert difference["mean"] == pytest.approx(paired.mean().item())
             assert difference["standard_error"] == pytest.approx(paired.std().item() / 5**0.5)
     assert "5-gram" in out
+    assert out.count("/elbo, iwae, pll, fivo ") == 1  # these are of the same steps
     lowest = min(expected, key=lambda reference: expected[reference].sum(1).mean())
     assert out.count(f"< {lowest}") >= 4  # hardly trained: below all of them
 
