@@ -118,6 +118,7 @@ def _print(study: Study, length: int) -> None:
         "ece[end]": "ECE",
         "classes[end]": "classes\nabove 5 %",
         "clear[end]": "clear\ndigits",
+        f"clear[n<={length}]": f"of those of\n≤ {length} steps",
         "kept[60%]": "class kept\nfrom 60 %",
         "kept[80%]": "class kept\nfrom 80 %",
     }

@@ -18,7 +18,8 @@ Completions are classified at the step at which the true digit ends, since model
   JS, entropy   class distribution over completions, compared with that of a calibrated classifier of prefixes, the
                 reference r(y | o_1..c)
   -log p, ECE   the same distribution, scored by the true class
-  clear digits  fraction of completions with a class probability above 0.9
+  clear digits  fraction of completions with a class probability above 0.9; also of the digits that end within the
+                training length, beyond which a model draws what it was not trained for
   class kept    of the completions with a clear class after 60 % (80 %) of the remaining steps, the fraction that end
                 in this class
   energy, CRPS  proper scores of the pixels sampled from the grey values, jointly and individually

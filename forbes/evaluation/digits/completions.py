@@ -245,8 +245,13 @@ def classes_at(frames: Tensor, observation: Tensor, context: int, step: Tensor, 
 
 
 def summarise(readings: Increments, prefixes: Prefixes, length: int) -> dict[str, Tensor]:
-    """Return the scores of each digit, `(B,)`, by name and step, from the output of `score_completions`."""
-    scores = summarise_classes(readings["classes"], prefixes) | {"clear[end]": readings["clear"][:, 0]}
+    """Return the scores of each digit, `(B,)`, by name and step, from the output of `score_completions`.
+
+    `clear[n<=length]` is the fraction of clear digits among those that end within the training length, or NaN.
+    """
+    clear, short = readings["clear"][:, 0], (prefixes.steps <= length).double()
+    scores = summarise_classes(readings["classes"], prefixes) | {"clear[end]": clear}
+    scores[f"clear[n<={length}]"] = ratio_values(clear * short, short)
     for share in _SHARES:
         kept, early = (readings[f"{name} {share}"][:, 0] for name in ("kept", "early"))
         scores[f"kept[{share}%]"] = ratio_values(kept, early)

@@ -129,6 +129,21 @@ def test_a_blur_of_all_digits_is_grey_and_not_clear(batch, classifiers):
     assert readings["grey"].min() > 0.7
 
 
+def test_clear_digits_are_also_counted_among_those_that_end_within_the_training_length(batch, prefixes, classifiers):
+    frames = repeated(batch, 2).clone()
+    place, end = torch.arange(len(batch.mask)), batch.mask.sum(1) - 1
+    length = int(prefixes.steps.median())
+    long = prefixes.steps > length
+    frames[:, place[long], end[long] - CONTEXT] = frames[0, :, -1].mean(0)  # long ones end as a blur of all
+
+    readings = score_completions(frames, batch, CONTEXT, LENGTH, classifiers)
+
+    truth = score_completions(repeated(batch, 2), batch, CONTEXT, LENGTH, classifiers)["clear"][~long]
+    torch.testing.assert_close(summarise(readings, prefixes, length)[f"clear[n<={length}]"].mean(), truth.mean())
+    assert summarise(readings, prefixes, length)["clear[end]"].mean() == pytest.approx(truth.sum().item() / len(long))
+    assert summarise(readings, prefixes, CONTEXT)[f"clear[n<={CONTEXT}]"].isnan().all()  # none ends so early
+
+
 def test_turning_into_another_digit_does_not_keep_the_class(batch, prefixes, classifiers):
     frames = repeated(batch, 2)
     kept = score_completions(frames, batch, CONTEXT, LENGTH, classifiers)
