@@ -34,8 +34,8 @@ def main(argv: Sequence[str]) -> None:
     args = parser().parse_args(argv)
     runs = load_all(args.runs, args.model, args.data, needs=("sample", "mean"))
     _check(args, runs)
-    data = runs[0].data
-    hashes = [data_sha256(run.data, args.split, args.sequences) for run in runs]
+    data = min((run.data for run in runs), key=lambda data: data.length)  # whole digits are drawn, whatever the length
+    hashes = [data_sha256(run.data, args.split, args.sequences, data.length) for run in runs]
     require_comparable(runs, hashes)
     assert isinstance(data.source, Strokes)
     classifiers = load_classifiers(data.source.origin)
@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> None:
     studies = []
     for context in sorted(set(args.prefixes)):
         chosen = select_prefixes(data, args.split, args.sequences, context, classifiers.prefix)
-        studies.append(study(named, classifiers, chosen, args.split, args.samples, args.seed))
+        studies.append(study(named, data, classifiers, chosen, args.split, args.samples, args.seed))
         _print(studies[-1], data.length)
     record = {
         "command": command_line("completions", *argv),

@@ -17,7 +17,7 @@ from forbes.data.strokes import classifiers
 from forbes.figures.completions import by_ambiguity
 from forbes.figures.grids import Bars, Panel, draw_bands, draw_panels
 from forbes.figures.style import BLUE
-from forbes.runs.folder import RunFolder
+from forbes.runs.folder import RunFolder, read_config
 
 NUMBERS = ["--digits", "12", "--samples", "4", "--prefixes", "3", "2"]
 
@@ -42,6 +42,18 @@ def test_pictures_and_tables_are_there(completed):
     names = {"completions-c2", "completions-c3", "completions-scores", "completions-errors"}
     expected = {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
     assert {path.name for path in completed.iterdir()} == expected | {"completions.json", "completions.csv"}
+
+
+def test_runs_of_other_lengths_complete_the_same_digits(runs, tiny_config, tmp_path):
+    longer = str(tmp_path / "longer")
+    length = read_config(RunFolder(runs[0]).config)["data"]["init_args"]["length"]
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", longer, "--data.length", str(length + 3)]) == 0
+
+    assert main(["completions", longer, runs[0], *NUMBERS, "-o", str(tmp_path / "figures")]) == 0
+
+    scores = pd.read_csv(tmp_path / "figures" / "completions.csv")
+    assert {name.partition("<=")[2] for name in scores["metric"] if "<=" in name} == {f"{length}]"}
+    assert scores[scores["minus"].notna()]["run"].unique().tolist() == [longer]
 
 
 def test_the_record_says_what_was_measured_and_how(completed, runs):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from forbes.data import Split
+from forbes.data import SequenceData, Split
 from forbes.data.strokes.classifiers import DigitClassifiers, calibration_error
 from forbes.evaluation.digits.completions import (
     Prefixes,
@@ -76,6 +76,7 @@ class Study(NamedTuple):
 
 def study(
     runs: Mapping[str, TrainedRun],
+    data: SequenceData,
     classifiers: DigitClassifiers,
     prefixes: Prefixes,
     split: Split,
@@ -85,7 +86,8 @@ def study(
     """Complete the same prefixes with every run, and score the completions.
 
     Args:
-        runs: runs on the same data, by title.
+        runs: runs by title.
+        data: their data, of the shortest length that one of them was trained with.
         classifiers: classifiers of these data.
         prefixes: prefixes to complete.
         split: split of the digits.
@@ -93,7 +95,7 @@ def study(
         seed: random seed for the noise, the same for every run.
     """
     first = next(iter(runs.values()))
-    data, length, context = first.data, first.data.length, prefixes.context
+    length, context = data.length, prefixes.context
 
     def measure(name: str, path: str | None, run: TrainedRun, score: Scorer) -> Row:
         where = f"{name}, {split} digits sorted by length"
