@@ -182,13 +182,13 @@ def open_loop_frames(model: StateSpaceModel, batch: SequenceBatch, context: int)
 def whole_sequences(data: SequenceData, split: Split, index: Tensor) -> SequenceBatch:
     """Return sequences up to the end of the longest one, with at least the data module's own length.
 
-    Those of a source that has no end are cut at eight times that length.
+    Those that have no end, even at eight times that length, are cut at that length.
     """
     for length in (data.length, 2 * data.length, 4 * data.length, 8 * data.length):
-        if not (batch := data.sequences(split, index, length)).mask[:, -1].any():
-            break
-    last = max(data.length, int(batch.mask.sum(1).max()))
-    return batch.first(last)  # (B, last, ...)
+        batch = data.sequences(split, index, length)
+        if not batch.mask[:, -1].any():
+            return batch.first(max(data.length, int(batch.mask.sum(1).max())))  # (B, longest, ...)
+    return data.sequences(split, index)
 
 
 def first_of_each_class(data: SequenceData, split: Split, count: int) -> Tensor:

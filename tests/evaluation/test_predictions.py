@@ -136,17 +136,10 @@ def test_whole_sequences_reach_the_longest_and_the_data_length(data):
     assert whole_sequences(data, "test", shortest).observation.shape[1] == max(points.min(), data.length)
 
 
-class Endless(Strokes):
-    """Digits after whose end nothing is written, for ever."""
-
-    def decode(self, compact):
-        batch = super().decode(compact)
-        return batch._replace(mask=torch.ones_like(batch.mask))
-
-
-def test_whole_sequences_of_a_source_without_an_end_are_cut(strokes_file):
-    data = SequenceDataModule(Endless(path=str(strokes_file), validation=20, frames="whole"), batch_size=4, length=6)
-    assert whole_sequences(data, "test", torch.arange(2)).observation.shape[1] == 8 * 6
+def test_whole_sequences_without_an_end_have_the_data_length(strokes_file):
+    source = Strokes(path=str(strokes_file), validation=20, frames="whole", end="observed")
+    data = SequenceDataModule(source, batch_size=4, length=6)
+    assert whole_sequences(data, "test", torch.arange(2)).observation.shape[1] == 6
 
 
 @pytest.mark.parametrize("count", [3, 10, 15])

@@ -60,6 +60,9 @@ class Strokes(SequenceSource):
         frames: `written` frames have the pixels added at each step: with one point per step one pixel, or none where
             the pen crosses its path. `whole` frames, as in the paper, show the first t points; most of their likelihood
             is that of redrawing past frames.
+        end: with `masked`, steps after a digit's end do not count, and nothing tells a model when a digit is finished:
+            it draws on. With `observed` they count, as steps at which nothing is written, and a model learns where
+            digits end.
 
     Example:
         >>> source = forbes.Strokes(frames="whole")
@@ -79,6 +82,7 @@ class Strokes(SequenceSource):
         points_per_step: int = 1,
         validation: int = 5000,
         frames: Literal["written", "whole"] = "written",
+        end: Literal["masked", "observed"] = "masked",
     ) -> None:
         require_at_least(1, "Strokes", points_per_step=points_per_step)
         require_at_least(0, "Strokes", validation=validation)
@@ -88,6 +92,7 @@ class Strokes(SequenceSource):
         self.validation = validation
         self.frames = frames
         self.increments = frames == "written"
+        self.end = end
 
     @cached_property
     def _splits(self) -> dict[Split, StrokeArrays]:
@@ -162,11 +167,12 @@ class Strokes(SequenceSource):
         first_visit = never.scatter_reduce(1, pixel, step, "amin")  # (B, H * W)
         first_visit, step = first_visit[:, None], time[:, None]  # (B, 1, H * W), (T, 1)
         frames = first_visit == step if self.increments else first_visit <= step  # (B, T, H * W)
+        mask = time * self.points_per_step < number[:, None]  # (B, T)
         return SequenceBatch(
             observation=frames.to(torch.uint8).view(batch, length, 1, SIDE, SIDE),  # (B, T, 1, H, W)
             action=torch.zeros(batch, length, 0, device=device),
             reward=torch.zeros(batch, length, device=device),
-            mask=time * self.points_per_step < number[:, None],  # (B, T)
+            mask=mask if self.end == "masked" else torch.ones_like(mask),
             state=torch.zeros(batch, length, 0, device=device),
             ended=torch.zeros(batch, length, dtype=torch.bool, device=device),
         )
