@@ -11,14 +11,14 @@ from rich.table import Table
 
 from forbes.commands.console import console
 from forbes.commands.parsers.completions import parser
-from forbes.data import Strokes
+from forbes.data import SequenceSource, Strokes
 from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, load_classifiers
 from forbes.errors import ForbesError
 from forbes.evaluation.adapters import load_all
 from forbes.evaluation.digits.completions import select_prefixes
 from forbes.evaluation.digits.study import Row, Study, entries, study
 from forbes.evaluation.estimates import Estimate
-from forbes.evaluation.runs import TrainedRun, data_name, data_sha256, require_comparable, run_titles
+from forbes.evaluation.runs import TrainedRun, data_name, require_comparable, run_titles
 from forbes.figures.completions import by_ambiguity, draw_class_scores, draw_completions, draw_errors
 from forbes.figures.style import save_png_and_pdf
 from forbes.files import replace_file
@@ -35,8 +35,7 @@ def main(argv: Sequence[str]) -> None:
     runs = load_all(args.runs, args.model, args.data, needs=("sample", "mean"))
     _check(args, runs)
     data = min((run.data for run in runs), key=lambda data: data.length)  # whole digits are drawn, whatever the length
-    hashes = [data_sha256(run.data, args.split, args.sequences, data.length) for run in runs]
-    require_comparable(runs, hashes)
+    require_comparable(runs, [_drawings(run.data.source) for run in runs])
     assert isinstance(data.source, Strokes)
     classifiers = load_classifiers(data.source.origin)
     named = dict(zip(run_titles(runs), runs, strict=True))
@@ -49,7 +48,7 @@ def main(argv: Sequence[str]) -> None:
         "command": command_line("completions", *argv),
         "commit": commit(),
         "seed": args.seed,
-        "data": {"name": data_name(data), "sha256": hashes[0]},
+        "data": {"name": data_name(data), "sha256": data.source.sha256()},
         "classifiers": CLASSIFIERS_SHA256,
         "runs": [_describe(name, run) for name, run in named.items()],
     }
@@ -73,6 +72,12 @@ def _check(args: Any, runs: Sequence[TrainedRun]) -> None:
             )
     if args.samples < 2:
         raise ForbesError(f"--samples {args.samples}: expected at least 2, since completions are compared. Choose more")
+
+
+def _drawings(source: SequenceSource) -> str:
+    """Return what determines the drawings of whole digits: neither the length nor whether ends are observed."""
+    assert isinstance(source, Strokes)
+    return f"{source.sha256()}, {source.points_per_step} points per step, {source.frames} frames"
 
 
 def _describe(name: str, run: TrainedRun) -> dict[str, Any]:

@@ -13,6 +13,12 @@ N are counts in the training split, c' is the context c without its earliest mov
 :math:`p_1` and targets of jumps :math:`p_J` are empirical, with :math:`\alpha` pseudo-counts spread over all pixels.
 The path determines the frames, so this is a lower bound of their log-probability: a model of frames with a lower score
 has not learned how a pen moves. Paths that are drawn stay in the image; moves that would leave it are not drawn.
+
+Where the end of a digit is observed, it comes with a probability that depends on the step only. With M(t) of the M
+training digits that have t steps, at each step before the end and at the first after it
+
+.. math:: \log(1 - h_t), \quad \log h_t, \qquad
+          h_t = \frac{M(t-1) + \alpha\, M / \sum_u u M(u)}{\sum_{u \ge t-1} M(u) + \alpha}
 """
 
 from collections.abc import Iterator
@@ -67,6 +73,7 @@ class NGrams:
             self.counts.append(torch.bincount(code[later], minlength=size).view(-1, _JUMP + 1).double())
         self.first = _log_frequency(pixel[:, 0])  # (H W,)
         self.target = _log_frequency(pixel[later & (move == _JUMP)])  # (H W,)
+        self.hazard = _hazard(source.steps("train"), length)  # (T,)
 
     def log_prob(self, split: Split, count: int) -> dict[int, Tensor]:
         """Return log p of each step of the first `count` digits in nats, by order, float64 `(N, T)`; 0 on padding."""
@@ -79,7 +86,14 @@ class NGrams:
             log_move = probability.gather(-1, index)[..., 0].log()  # (N, P)
             log_prob = (log_pixel + log_move * ~begins) * valid  # (N, P)
             by_order[order] = log_prob.unflatten(1, (self.length, -1)).sum(-1)  # (N, T)
-        return {order: by_order[order] for order in ORDERS}
+        end = self._log_end(self.source.steps(split)[:count]) if self.source.end == "observed" else 0.0
+        return {order: by_order[order] + end for order in ORDERS}
+
+    def _log_end(self, steps: Tensor) -> Tensor:
+        """Return log p of where each digit ends, given its number of steps, at each step: `(N,)` to `(N, T)`."""
+        before = torch.arange(self.length)  # (T,), number of steps before each
+        goes_on, ends = before < steps[:, None], before == steps[:, None]  # (N, T)
+        return (1 - self.hazard).log() * goes_on + self.hazard.log() * ends
 
     def complete(self, points: Tensor, count: int, order: int) -> Tensor:
         """Draw more points of each path.
@@ -90,11 +104,22 @@ class NGrams:
             order: order n, at most 5.
 
         Returns:
-            The whole paths, uint8 `(B, P + count, 2)`.
+            The whole paths, uint8 `(B, P + count, 2)`. Where the end of a digit is observed, the last point of an ended
+            path is repeated.
         """
+        ended = torch.zeros(len(points), 1, dtype=torch.bool)
         for _ in range(count):
-            points = torch.cat((points, self._next(points, order)[:, None]), 1)  # (B, P + 1, 2)
+            if self.source.end == "observed":
+                ended |= self._ends(points)
+            point = torch.where(ended, points[:, -1], self._next(points, order))  # (B, 2)
+            points = torch.cat((points, point[:, None]), 1)  # (B, P + 1, 2)
         return points
+
+    def _ends(self, points: Tensor) -> Tensor:
+        """Draw whether each path ends with the points that it has, `(B, P, 2)` to `(B, 1)`."""
+        steps, rest = divmod(points.shape[1], self.source.points_per_step)
+        hazard = 0.0 if rest else self.hazard[min(steps, self.length - 1)]
+        return torch.rand(len(points), 1) < hazard
 
     def _next(self, points: Tensor, order: int) -> Tensor:
         """Draw the next point of each path, `(B, P, 2)` to uint8 `(B, 2)`."""
@@ -138,6 +163,14 @@ def _moves(paths: StrokePoints) -> _Moves:
     start = torch.full_like(move[:, :1], _START)
     valid = torch.arange(x.shape[1]) < paths.number[:, None]  # (B, P)
     return _Moves(SIDE * y + x, torch.cat((start, move), 1), valid)  # (B, P)
+
+
+def _hazard(steps: Tensor, length: int) -> Tensor:
+    """Return the probability that a digit which has not ended does so before step t = 1 … T, float64 `(T,)`."""
+    number = torch.bincount(steps, minlength=length).double()  # (L,)
+    alive = number.flip(0).cumsum(0).flip(0)  # (L,), of at least so many steps
+    mean = len(steps) / int(steps.sum())
+    return ((number + _PSEUDO_COUNTS * mean) / (alive + _PSEUDO_COUNTS))[:length]
 
 
 def _context(move: Tensor, order: int) -> Tensor:

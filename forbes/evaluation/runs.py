@@ -170,11 +170,11 @@ def _kind(model: BeliefModel) -> type[nn.Module]:
 
 
 def split_batches(
-    data: SequenceData, split: Split, sequences: int, batch_size: int, length: int | None = None
+    data: SequenceData, split: Split, sequences: int, batch_size: int
 ) -> Iterator[tuple[int, SequenceBatch]]:
     """Yield the first `sequences` sequences of a split in order, as batches with the index of their first sequence."""
     for index in torch.arange(sequences).split(batch_size):
-        yield int(index[0]), data.sequences(split, index, length)
+        yield int(index[0]), data.sequences(split, index)
 
 
 def data_name(data: SequenceData) -> str:
@@ -182,10 +182,10 @@ def data_name(data: SequenceData) -> str:
     return f"{data.source}, {data.length} steps"
 
 
-def data_sha256(data: SequenceData, split: Split, sequences: int, length: int | None = None) -> str:
-    """Hash the first `sequences` sequences of a split, as the model sees them, or cut or padded to `length` steps."""
+def data_sha256(data: SequenceData, split: Split, sequences: int) -> str:
+    """Hash the first `sequences` sequences of a split, as the model sees them."""
     digest = hashlib.sha256()
-    for _, batch in split_batches(data, split, sequences, 500, length):
+    for _, batch in split_batches(data, split, sequences, batch_size=500):
         parts = batch.observation
         observed = [parts[name] for name in sorted(parts)] if isinstance(parts, dict) else [parts]
         for values in (*observed, batch.action, batch.mask):

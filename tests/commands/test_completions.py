@@ -44,10 +44,11 @@ def test_pictures_and_tables_are_there(completed):
     assert {path.name for path in completed.iterdir()} == expected | {"completions.json", "completions.csv"}
 
 
-def test_runs_of_other_lengths_complete_the_same_digits(runs, tiny_config, tmp_path):
+def test_runs_of_other_lengths_and_with_observed_ends_complete_the_same_digits(runs, tiny_config, tmp_path):
     longer = str(tmp_path / "longer")
     length = read_config(RunFolder(runs[0]).config)["data"]["init_args"]["length"]
-    assert main(["fit", "--config", str(tiny_config), "--run_dir", longer, "--data.length", str(length + 3)]) == 0
+    longer_digits = ["--data.length", str(length + 3), "--data.source.end", "observed"]
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", longer, *longer_digits]) == 0
 
     assert main(["completions", longer, runs[0], *NUMBERS, "-o", str(tmp_path / "figures")]) == 0
 

@@ -133,6 +133,49 @@ def test_padding_counts_nothing(source):
     assert all((values[batch.mask] < 0).all() and not values[~batch.mask].any() for values in found.values())
 
 
+def hazard_slowly(train, steps):
+    """The probability that a digit of at least so many steps has no more, with counts in lists."""
+    ended, alive = (sum(each) for each in ([n == steps for n in train], [n >= steps for n in train]))
+    return (ended + 5 * len(train) / sum(train)) / (alive + 5)
+
+
+@pytest.mark.parametrize("points_per_step", [1, 2])
+def test_an_observed_end_costs_what_its_step_tells(points_per_step):
+    length, order = 40 // points_per_step, 3
+    source = Strokes(validation=59_900, points_per_step=points_per_step)  # a training split of 100 digits
+    observed = Strokes(validation=59_900, points_per_step=points_per_step, end="observed")
+    steps, train = source.steps("test")[:100].tolist(), source.steps("train").tolist()
+
+    found = [NGrams(each, length).log_prob("test", 100)[order] for each in (observed, source)]
+
+    hazard = [hazard_slowly(train, steps) for steps in range(length)]
+    survival = [math.prod(1 - h for h in hazard[:n]) for n in range(length + 1)]
+    ends = {n: survival[n] * hazard[n] for n in range(length)}
+    assert sum(ends.values()) + survival[-1] == pytest.approx(1)
+    expected = [math.log(ends.get(n, survival[-1])) for n in steps]
+    assert max(steps) > length > min(steps)
+    torch.testing.assert_close((found[0] - found[1]).sum(1), torch.tensor(expected, dtype=torch.float64))
+    after = torch.arange(length) > torch.tensor(steps)[:, None]
+    assert not found[0][after].any()
+
+
+def test_paths_end_as_often_as_their_step_tells_and_for_ever():
+    source = Strokes(validation=59_900, end="observed")
+    ngrams, count = NGrams(source, 60), 20_000
+    path = torch.tensor([paths_of(source, "test", 36)[0]] * count, dtype=torch.uint8)
+    torch.manual_seed(0)
+
+    drawn = ngrams.complete(path, 2, 1)
+
+    steps = path.shape[1]
+    ended = (drawn[:, steps] == drawn[:, steps - 1]).all(-1)
+    train = source.steps("train").tolist()
+    hazard, wrong = (hazard_slowly(train, n) for n in (steps, steps - 4))
+    z, power = ((ended.sum().item() - count * p) / math.sqrt(count * p * (1 - p)) for p in (hazard, wrong))
+    assert abs(z) < 3.3 < abs(power)  # 0.001
+    assert (drawn[ended, steps + 1] == drawn[ended, steps]).all()
+
+
 def test_longer_contexts_tell_more_of_the_bundled_digits():
     found = fit_ngrams(Strokes(), 30).log_prob("test", 10_000)
 

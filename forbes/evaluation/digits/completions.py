@@ -85,7 +85,8 @@ class Prefixes(NamedTuple):
         for rows in torch.arange(len(self.digits)).split(_ROWS):
             points = data.source.gather(split, self.digits[rows], longest).points  # (B, T * points_per_step, 2)
             state = points.reshape(len(rows), longest, -1).float()  # (B, T, 2 * points_per_step)
-            yield int(rows[0]), data.sequences(split, self.digits[rows], longest)._replace(state=state)
+            mask = torch.arange(longest) < self.steps[rows, None]  # (B, T), also where the end is observed
+            yield int(rows[0]), data.sequences(split, self.digits[rows], longest)._replace(state=state, mask=mask)
 
 
 def select_prefixes(

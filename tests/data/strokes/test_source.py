@@ -106,6 +106,18 @@ def test_the_mask_is_true_until_a_digit_is_whole(source, points_per_step, steps)
     assert strokes.steps("train")[:3].tolist() == steps
 
 
+@pytest.mark.parametrize("frames", ["written", "whole"])
+def test_an_observed_end_counts_the_steps_after_it(source, frames):
+    masked, observed = source(frames=frames), source(frames=frames, end="observed")
+
+    ended, going = (each.decode(each.gather("train", torch.tensor([0, 1, 2]), 8)) for each in (masked, observed))
+
+    assert not ended.mask.all()
+    assert going.mask.all()
+    assert torch.equal(going.observation, ended.observation)
+    assert torch.equal(observed.steps("train"), masked.steps("train"))
+
+
 def test_a_cut_digit_is_the_beginning_of_the_whole_one(source):
     strokes = source(points_per_step=2)
     index = torch.tensor([1, 0])

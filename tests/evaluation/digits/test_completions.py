@@ -85,6 +85,14 @@ def test_prefixes_are_of_digits_that_continue_sorted_by_length(data, classifiers
     )
 
 
+def test_digits_end_where_they_do_also_if_models_observe_their_end(classifiers, prefixes):
+    observed = SequenceDataModule(Strokes(frames="whole", end="observed"), length=LENGTH)
+    chosen = select_prefixes(observed, "test", 20, CONTEXT, classifiers.prefix)
+
+    steps = [batch.mask.sum(1) for _, batch in chosen.batches(observed, "test")]
+    assert torch.equal(torch.cat(steps), prefixes.steps)
+
+
 def test_too_few_digits_that_continue_are_an_error(data, classifiers):
     longest = int(data.source.steps("test")[:20].max())
     with pytest.raises(ForbesError, match=rf"--prefixes {longest}: of 20 digits 0 continue after {longest} steps"):
