@@ -54,7 +54,7 @@ def print_references(measured: Sequence[EvaluatedRun]) -> None:
     }
     if named := ", ".join(f"{path} ({', '.join(scores)})" for path, scores in below.items() if scores):
         text = (
-            f"<: below this reference: {named}. If its tightest score is, a model has learned less than the reference."
+            f"<: below this reference: {named}. A model whose tightest score is below one has learned less than it."
         )
         screen.print(escape(text), soft_wrap=True)
     differences = {
