@@ -1,10 +1,11 @@
 """The error that a user can fix: one sentence that says where, what and what to do."""
 
 import errno
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["FULL", "ForbesError", "require_at_least", "unwritable"]
+__all__ = ["FULL", "ForbesError", "require_at_least", "require_one_of", "unwritable"]
 
 FULL = {
     errno.ENOSPC: "Free some space, or choose another folder",
@@ -47,6 +48,25 @@ def require_at_least(least: float, where: str, **numbers: Any) -> None:
     for name, number in numbers.items():
         if number is None or not number >= least:
             raise ForbesError(f"{where}: {name} is {number}, expected at least {least}")
+
+
+def require_one_of(options: Sequence[str], where: str, **choices: str) -> None:
+    """Raise a ForbesError for the first choice that is none of the options. The command line checks them by their type.
+
+    Args:
+        options: what may be chosen.
+        where: the name that the sentence begins with, e.g. that of the class.
+        **choices: arguments by name.
+
+    Example:
+        >>> forbes.errors.require_one_of(("masked", "observed"), "Strokes", end="seen")
+        Traceback (most recent call last):
+        ...
+        forbes.errors.ForbesError: Strokes: end is 'seen', expected masked or observed
+    """
+    for name, choice in choices.items():
+        if choice not in options:
+            raise ForbesError(f"{where}: {name} is {choice!r}, expected {' or '.join(options)}")
 
 
 def unwritable(path: Path | str, error: OSError) -> ForbesError:

@@ -53,9 +53,7 @@ def print_references(measured: Sequence[EvaluatedRun]) -> None:
         for evaluated in measured
     }
     if named := ", ".join(f"{path} ({', '.join(scores)})" for path, scores in below.items() if scores):
-        text = (
-            f"<: below this reference: {named}. A model whose tightest score is below one has learned less than it."
-        )
+        text = f"<: below this reference: {named}. A model whose tightest score is below one has learned less than it."
         screen.print(escape(text), soft_wrap=True)
     differences = {
         str(number): {name: over for name, entry in evaluated.entries.items() if (over := _over_best(entry))}

@@ -182,7 +182,7 @@ def open_loop_frames(model: StateSpaceModel, batch: SequenceBatch, context: int)
 def whole_sequences(data: SequenceData, split: Split, index: Tensor) -> SequenceBatch:
     """Return sequences up to the end of the longest one, with at least the data module's own length.
 
-    Those that have no end, even at eight times that length, are cut at that length.
+    Those that have no end even at eight times that length have the module's.
     """
     for length in (data.length, 2 * data.length, 4 * data.length, 8 * data.length):
         batch = data.sequences(split, index, length)

@@ -13,7 +13,8 @@ Complete the beginnings of digits with trained models, and score the completions
 
   forbes completions runs/compare/forbes-0 runs/compare/rssm-0 -o figures
 
-Completions are classified at the step at which the true digit ends, since models do not learn where digits end.
+Completions are classified at the step at which the true digit ends. Models do not learn where digits end, and draw on,
+unless they are trained with --data.source.end observed.
 
   JS, entropy   class distribution over completions, compared with that of a calibrated classifier of prefixes, the
                 reference r(y | o_1..c)

@@ -12,7 +12,7 @@ from forbes.bundled import bundled
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.data.strokes.dejong import dejong_path, verify_dejong
 from forbes.data.strokes.file import SIDE, StrokeArrays, load_strokes, sha256_of_arrays
-from forbes.errors import ForbesError, require_at_least
+from forbes.errors import ForbesError, require_at_least, require_one_of
 from forbes.rounding import ceil_div
 from forbes.shapes import printed_by_shape
 
@@ -86,6 +86,9 @@ class Strokes(SequenceSource):
     ) -> None:
         require_at_least(1, "Strokes", points_per_step=points_per_step)
         require_at_least(0, "Strokes", validation=validation)
+        require_one_of(("bundled", "dejong"), "Strokes", origin=origin)
+        require_one_of(("written", "whole"), "Strokes", frames=frames)
+        require_one_of(("masked", "observed"), "Strokes", end=end)
         self.origin = origin
         self.path = path
         self.points_per_step = points_per_step

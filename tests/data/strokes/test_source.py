@@ -208,6 +208,9 @@ def test_another_set_does_not_pass_for_the_papers(source):
     [
         ({"points_per_step": 0}, "points_per_step is 0, expected at least 1"),
         ({"validation": -1}, "validation is -1, expected at least 0"),
+        ({"origin": "jong"}, "origin is 'jong', expected bundled or dejong"),
+        ({"frames": "wrote"}, "frames is 'wrote', expected written or whole"),
+        ({"end": "observe"}, "end is 'observe', expected masked or observed"),
     ],
 )
 def test_a_value_out_of_range_is_refused(options, message):
