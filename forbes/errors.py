@@ -1,7 +1,7 @@
 """The error that a user can fix: one sentence that says where, what and what to do."""
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,7 @@ def require_at_least(least: float, where: str, **numbers: Any) -> None:
             raise ForbesError(f"{where}: {name} is {number}, expected at least {least}")
 
 
-def require_one_of(options: Sequence[str], where: str, **choices: str) -> None:
+def require_one_of(options: Collection[str], where: str, **choices: str) -> None:
     """Raise a ForbesError for the first choice that is none of the options. The command line checks them by their type.
 
     Args:
@@ -62,11 +62,11 @@ def require_one_of(options: Sequence[str], where: str, **choices: str) -> None:
         >>> forbes.errors.require_one_of(("masked", "observed"), "Strokes", end="seen")
         Traceback (most recent call last):
         ...
-        forbes.errors.ForbesError: Strokes: end is 'seen', expected masked or observed
+        forbes.errors.ForbesError: Strokes: end is 'seen', expected masked or observed. Choose one of them
     """
     for name, choice in choices.items():
         if choice not in options:
-            raise ForbesError(f"{where}: {name} is {choice!r}, expected {' or '.join(options)}")
+            raise ForbesError(f"{where}: {name} is {choice!r}, expected {' or '.join(options)}. Choose one of them")
 
 
 def unwritable(path: Path | str, error: OSError) -> ForbesError:

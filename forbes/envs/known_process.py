@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forbes.envs.base import Environment, Step
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_one_of
 from forbes.pomdps import ExactBelief, FiniteBelief, GaussianMixtureBelief, Process
 from forbes.pomdps.base import require_positive
 from forbes.pomdps.hmm import FiniteProcess
@@ -43,8 +43,7 @@ class KnownProcess(Environment):
 
     def __init__(self, process: Process, time_limit: int = 75, shows: Shown = "observation") -> None:
         require_positive("KnownProcess", time_limit=time_limit)
-        if shows not in get_args(Shown):
-            raise ForbesError(f"shows is {shows!r}, expected {' or '.join(get_args(Shown))}. Choose one of them")
+        require_one_of(get_args(Shown), "KnownProcess", shows=shows)
         self.process, self.time_limit = process, time_limit
         self.shows: Shown = shows
         self.observation_shape, self.action_dim = (process.observation_dim,), process.action_dim

@@ -188,7 +188,7 @@ def whole_sequences(data: SequenceData, split: Split, index: Tensor) -> Sequence
         batch = data.sequences(split, index, length)
         if not batch.mask[:, -1].any():
             return batch.first(max(data.length, int(batch.mask.sum(1).max())))  # (B, longest, ...)
-    return data.sequences(split, index)
+    return batch.first(data.length)  # (B, T, ...)
 
 
 def first_of_each_class(data: SequenceData, split: Split, count: int) -> Tensor:

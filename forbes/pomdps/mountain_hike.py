@@ -1,12 +1,12 @@
 """The mountain hike of DVRL: a walk in the plane, whose belief is a Gaussian or a mixture of three Gaussians."""
 
 import math
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from forbes.errors import ForbesError
+from forbes.errors import require_one_of
 from forbes.pomdps.base import AffineGaussian, ExactFilter, Process, require_positive
 from forbes.pomdps.beliefs import GaussianMixtureBelief
 from forbes.pomdps.distributions import DiagonalGaussian, draw_normal
@@ -64,8 +64,7 @@ class MountainHike(Process):
     action_scale = MAX_STEP
 
     def __init__(self, start: Start = "single", observation_std: float = 0.1) -> None:
-        if start not in get_args(Start):
-            raise ForbesError(f"MountainHike: start is {start!r}, expected {' or '.join(STARTS)}. Choose one of them")
+        require_one_of(STARTS, "MountainHike", start=start)
         require_positive("MountainHike", observation_std=observation_std)
         self.start: Start = start
         self.observation_std = observation_std
