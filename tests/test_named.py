@@ -40,7 +40,7 @@ def test_all_are_tried():
 def test_a_name_is_a_call():
     assert repr(Tiger(0.9)) == "Tiger(accuracy=0.9)"
     assert repr(MountainHike("multi", observation_std=1.5)) == "MountainHike(start=multi, observation_std=1.5)"
-    assert repr(Strokes(frames="whole")).endswith("points_per_step=1, validation=5000, frames=whole)")
+    assert repr(Strokes(frames="whole")).endswith("points_per_step=1, validation=5000, frames=whole, end=masked)")
 
 
 def test_data_of_a_process_are_named_with_its_numbers():
