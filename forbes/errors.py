@@ -5,7 +5,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-__all__ = ["FULL", "ForbesError", "require_at_least", "require_one_of", "unwritable"]
+__all__ = ["FULL", "ForbesError", "require_at_least", "require_one_of", "require_positive", "unwritable"]
 
 FULL = {
     errno.ENOSPC: "Free some space, or choose another folder",
@@ -48,6 +48,13 @@ def require_at_least(least: float, where: str, **numbers: Any) -> None:
     for name, number in numbers.items():
         if number is None or not number >= least:
             raise ForbesError(f"{where}: {name} is {number}, expected at least {least}")
+
+
+def require_positive(where: str, **numbers: float) -> None:
+    """Raise a ForbesError unless every number is above 0."""
+    for name, number in numbers.items():
+        if not number > 0:
+            raise ForbesError(f"{where}: {name} is {number}, expected more than 0. Choose another")
 
 
 def require_one_of(options: Collection[str], where: str, **choices: str) -> None:

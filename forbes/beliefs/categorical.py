@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from forbes.beliefs.base import BeliefHead
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 
 __all__ = ["CategoricalBelief", "draw_one_hot", "one_hot_of"]
 
@@ -31,7 +31,7 @@ class CategoricalBelief(BeliefHead):
             :math:`G \log(K / m)` nats.
 
     Raises:
-        ForbesError: when `state_dim` is not a multiple of `classes`, or a weight is outside its interval.
+        ForbesError: when `classes` is below 1, `state_dim` not a multiple of it, or a weight outside its interval.
 
     Example:
         >>> belief = forbes.CategoricalBelief(state_dim=2, context_dim=8, classes=2)
@@ -51,6 +51,7 @@ class CategoricalBelief(BeliefHead):
         uniform_mix: float = 0.0,
     ) -> None:
         super().__init__(state_dim, context_dim)
+        require_at_least(1, "CategoricalBelief", classes=classes)
         if state_dim % classes:
             raise ForbesError(f"CategoricalBelief: state_dim is {state_dim}, expected a multiple of classes, {classes}")
         if not 0 <= uniform_mix < 1:
@@ -103,7 +104,7 @@ def _kl_weights(kl_balance: float | tuple[float, float] | None) -> tuple[float, 
     """Return the weights of the gradients of prior and posterior; None where both are 1."""
     if kl_balance is None:
         return None
-    of_prior, of_posterior = kl_balance if isinstance(kl_balance, tuple) else (kl_balance, 1 - kl_balance)
+    of_prior, of_posterior = (kl_balance, 1 - kl_balance) if isinstance(kl_balance, int | float) else kl_balance
     if not (0 <= of_prior <= 1 and 0 <= of_posterior <= 1):
         raise ForbesError(
             f"CategoricalBelief: kl_balance is {kl_balance}, expected 0 to 1. DreamerV2 has 0.8, DreamerV3 (1, 0.1)"

@@ -10,6 +10,7 @@ from forbes.beliefs.base import BeliefHead, Sampler
 from forbes.beliefs.coupling import AffineCoupling, ConditionalFlow
 from forbes.beliefs.gaussian import GaussianBelief
 from forbes.beliefs.splines import SplineCoupling
+from forbes.errors import require_one_of
 from forbes.performance.time_loop import TimeLoop
 
 __all__ = ["FlowBelief"]
@@ -33,6 +34,9 @@ class FlowBelief(BeliefHead):
             al., 2019).
         bins: number of bins per spline; 8 as in Durkan et al.
 
+    Raises:
+        ForbesError: when a size is below its minimum, `min_std` below 0, or `coupling` another word.
+
     Example:
         >>> belief = forbes.FlowBelief(state_dim=2, context_dim=8, layers=3)
         >>> state, log_prob = belief.rsample(torch.zeros(5, 8), sample_shape=(100,))
@@ -51,6 +55,7 @@ class FlowBelief(BeliefHead):
         bins: int = 8,
     ) -> None:
         super().__init__(state_dim, context_dim)
+        require_one_of(("affine", "spline"), "FlowBelief", coupling=coupling)
         self.base = GaussianBelief(state_dim, context_dim, min_std)
         with torch.random.fork_rng(devices=[]):  # the same seed gives a Gaussian belief the same other weights
             family = AffineCoupling if coupling == "affine" else partial(SplineCoupling, bins=bins)

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.base import BeliefHead, Sampler
+from forbes.errors import require_at_least
 from forbes.performance.fusion import fused
 from forbes.performance.time_loop import TimeLoop
 
@@ -28,6 +29,9 @@ class GaussianBelief(BeliefHead):
         context_dim: C, the dimension of the context.
         min_std: smallest standard deviation; 0.1 as in PlaNet and Dreamer.
 
+    Raises:
+        ForbesError: when `min_std` is below 0.
+
     Example:
         >>> belief = forbes.GaussianBelief(state_dim=2, context_dim=8)
         >>> state, log_prob = belief.rsample(torch.zeros(5, 8), sample_shape=(100,))
@@ -37,6 +41,7 @@ class GaussianBelief(BeliefHead):
 
     def __init__(self, state_dim: int, context_dim: int, min_std: float = 0.1) -> None:
         super().__init__(state_dim, context_dim)
+        require_at_least(0, type(self).__name__, min_std=min_std)
         self.min_std = min_std
         self.parameters_of = nn.Linear(context_dim, 2 * state_dim)
 

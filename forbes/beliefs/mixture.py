@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from forbes.beliefs.base import BeliefHead
+from forbes.errors import require_at_least
 from forbes.shapes import printed_by_shape
 
 __all__ = ["Mixture", "MixtureBelief"]
@@ -52,6 +53,9 @@ class MixtureBelief(BeliefHead):
         components: M, the number of Gaussians.
         min_std: smallest standard deviation, as for `GaussianBelief`.
 
+    Raises:
+        ForbesError: when M is below 1, or `min_std` below 0.
+
     Example:
         >>> belief = forbes.MixtureBelief(state_dim=2, context_dim=8, components=3)
         >>> state, log_prob = belief.rsample(torch.zeros(5, 8), sample_shape=(100,))
@@ -61,6 +65,8 @@ class MixtureBelief(BeliefHead):
 
     def __init__(self, state_dim: int, context_dim: int, components: int = 5, min_std: float = 0.1) -> None:
         super().__init__(state_dim, context_dim)
+        require_at_least(1, "MixtureBelief", components=components)
+        require_at_least(0, "MixtureBelief", min_std=min_std)
         self.components, self.min_std = components, min_std
         self.parameters_of = nn.Linear(context_dim, components * (1 + 2 * state_dim))
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from lightning import LightningModule, Trainer
@@ -15,9 +15,9 @@ from matplotlib.transforms import blended_transform_factory
 from torch import Tensor
 
 from forbes.beliefs import BeliefHead
-from forbes.callbacks.picture import PictureCallback, require_one_array, require_state
+from forbes.callbacks.picture import PictureCallback, require_one_array, require_state, require_validation
 from forbes.data import SequenceDataModule
-from forbes.errors import require_at_least
+from forbes.errors import ForbesError, require_at_least
 from forbes.evaluation.predictions import first_of_each_class
 from forbes.figures.prediction_grid import colour_of
 from forbes.figures.style import BLACK, GREY, PAGE, density_map, paper_style
@@ -34,8 +34,8 @@ class BeliefPlot(PictureCallback):
     """Draws `figures/beliefs.png`: frame, prior p(s_t | h_t) and posterior q(s_t | h_t, o_t) at some steps of a digit.
 
     Each panel shows density and samples. The prior's panel also shows samples of the posterior, in its colour. For a
-    two-dimensional state the density is exact. Otherwise samples are projected on the prior's two leading principal
-    components (labelled with their fraction of the variance), and the density is a kernel estimate. For a
+    two-dimensional state the density is exact. For more dimensions samples are projected on the prior's two leading
+    principal components (labelled with their fraction of the variance), and the density is a kernel estimate. For a
     `ParticleModel` it shows one trajectory of the proposal. A `VectorModel` has no state to plot.
 
     Args:
@@ -54,9 +54,12 @@ class BeliefPlot(PictureCallback):
         self.digits, self.columns, self.samples = digits, columns, samples
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse a model without a state, and observations of several parts, when the training starts."""
+        """Refuse a model without a state of two dimensions, and data that cannot be drawn, when the training starts."""
         require_one_array(self, trainer)
+        require_validation(self, trainer)
         require_state(self, pl_module)
+        if (dimensions := cast(StateSpaceModel, pl_module.model).state_dim) < 2:
+            raise ForbesError(f"BeliefPlot: state_dim is {dimensions}, expected at least 2. Remove this callback")
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """Draw the beliefs along the first digits of the validation split."""

@@ -3,13 +3,14 @@
 from typing import TYPE_CHECKING
 
 import torch
-from lightning import Trainer
+from lightning import LightningModule, Trainer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.callbacks.picture import PictureCallback
+from forbes.callbacks.picture import PictureCallback, require_validation
 from forbes.data import SequenceDataModule
+from forbes.errors import require_at_least
 from forbes.evaluation.references import reference_means
 from forbes.figures.prediction_grid import colour_of
 from forbes.figures.style import BLACK, GREY, PAGE, draw_references, paper_style, show_settled
@@ -40,7 +41,12 @@ class ElboCurve(PictureCallback):
 
     def __init__(self, sequences: int = 200, every: int = 5) -> None:
         super().__init__(every)
+        require_at_least(1, "ElboCurve", sequences=sequences)
         self.sequences = sequences
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Refuse data without a validation split when the training starts."""
+        require_validation(self, trainer)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """Draw the curves."""

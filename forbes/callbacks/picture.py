@@ -10,7 +10,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.data import SequenceBatch, SequenceDataModule
+from forbes.data import Experience, SequenceBatch, SequenceDataModule
 from forbes.data.datamodule import datamodule_of
 from forbes.errors import ForbesError, require_at_least
 from forbes.evaluation.predictions import first_of_each_class
@@ -28,6 +28,7 @@ __all__ = [
     "require_frames",
     "require_one_array",
     "require_state",
+    "require_validation",
     "shown_sequences",
 ]
 
@@ -111,6 +112,15 @@ def shown_sequences(data: SequenceDataModule, count: int, module: LightningModul
     else:
         batch = data.sequences("train", data.source.latest(count))
     return batch.to(module.device)
+
+
+def require_validation(callback: Callback, trainer: Trainer) -> None:
+    """Raise a ForbesError if the data have no validation split: those of an agent, or too few episodes."""
+    source = datamodule_of(trainer).source
+    if isinstance(source, Experience) or not source.size("validation"):
+        raise ForbesError(
+            f"{type(callback).__name__}: the data have no validation split, from which it draws. Remove this callback"
+        )
 
 
 def require_context(callback: Callback, trainer: Trainer, context: int) -> None:

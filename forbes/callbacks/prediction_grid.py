@@ -3,7 +3,13 @@
 from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
-from forbes.callbacks.picture import PictureCallback, require_context, require_frames, require_one_array
+from forbes.callbacks.picture import (
+    PictureCallback,
+    require_context,
+    require_frames,
+    require_one_array,
+    require_validation,
+)
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.predictions import first_of_each_class, whole_sequences
@@ -38,6 +44,7 @@ class PredictionGrid(PictureCallback):
         """Refuse data that cannot be drawn when the training starts."""
         require_one_array(self, trainer)
         require_frames(self, trainer)
+        require_validation(self, trainer)
         require_context(self, trainer, self.context)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:

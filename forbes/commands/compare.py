@@ -11,6 +11,7 @@ from rich.markdown import Markdown
 
 from forbes.commands.console import console
 from forbes.commands.evaluate import evaluate, wanted_metrics
+from forbes.commands.evaluate import main as evaluate_command
 from forbes.commands.jobs import Launcher, run_jobs
 from forbes.commands.launchers import open_launcher
 from forbes.commands.parsers.compare import parser, require_sweep
@@ -48,8 +49,11 @@ def main(argv: Sequence[str]) -> None:
         for config, of_config in zip(args.configs, folders.values(), strict=True)
         for seed, run in of_config.items()
     ]
-    _require_measurable(args, flags)
+    agents = _require_measurable(args, flags)
     _train(trainings, launcher)
+    if agents:
+        runs = [training.folder for training in trainings]
+        return evaluate_command([*runs, "--seed", str(args.seed), "--device", args.device])
     loaded = load_runs([of_config[0] for of_config in folders.values()])
     wanted = wanted_metrics(loaded, args)
     families = [
@@ -80,16 +84,26 @@ def _run_folders(configs: Sequence[str], seeds: int, folder: Path) -> dict[str, 
     return {name: {seed: str(folder / f"{name}-{seed}") for seed in range(seeds)} for name in names}
 
 
-def _require_measurable(args: Any, flags: Sequence[str]) -> None:
-    """Refuse configurations that could not be measured or compared, before days are spent on their training."""
-    untrained = []
+def _require_measurable(args: Any, flags: Sequence[str]) -> bool:
+    """Refuse configurations that could not be measured or compared, before days are spent on their training.
+
+    Returns:
+        Whether they are of agents, which are compared by their returns.
+    """
+    untrained, kinds = [], set()
     for name in args.configs:
         config = yaml.safe_load(complete_configuration(name, *flags))
+        if config["model"]["class_path"].endswith(".KnownBelief"):
+            raise ForbesError(f"{name}: beliefs of a known process have scores of their own. Use forbes beliefs")
+        kinds.add(config["data"]["init_args"]["source"]["class_path"].endswith(".Experience"))
         if is_world(config):
             world, data = build_world(config, Path(name), args.output)
             untrained.append(TrainedRun(name, world.model, data, checkpoint="", config=config))
+    if len(kinds) > 1:
+        raise ForbesError("an agent is compared by its return, a world model by its scores. Name one kind")
     if untrained:
         wanted_metrics(untrained, args)
+    return kinds == {True}
 
 
 def _train(trainings: Sequence[Training], launcher: Launcher) -> None:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from forbes.commands.console import console
 from forbes.commands.parsers.completions import parser
-from forbes.data import SequenceSource, Strokes
+from forbes.data import SequenceData, SequenceSource, Strokes
 from forbes.data.strokes.classifiers import CLASSIFIERS_SHA256, load_classifiers
 from forbes.errors import ForbesError
 from forbes.evaluation.adapters import load_all
@@ -34,8 +34,8 @@ def main(argv: Sequence[str]) -> None:
     args = parser().parse_args(argv)
     runs = load_all(args.runs, args.model, args.data, needs=("sample", "mean"))
     _check(args, runs)
-    data = min((run.data for run in runs), key=lambda data: data.length)  # whole digits are drawn, whatever the length
     require_comparable(runs, [_drawings(run.data.source) for run in runs])
+    data = _shared_data(runs)
     assert isinstance(data.source, Strokes)
     classifiers = load_classifiers(data.source.origin)
     named = dict(zip(run_titles(runs), runs, strict=True))
@@ -78,6 +78,16 @@ def _drawings(source: SequenceSource) -> str:
     """Return what determines the drawings of whole digits: neither the length nor whether ends are observed."""
     assert isinstance(source, Strokes)
     return f"{source.sha256()}, {source.points_per_step} points per step, {source.frames} frames"
+
+
+def _shared_data(runs: Sequence[TrainedRun]) -> SequenceData:
+    """Return the data of the shortest length, and if there are both, with masked ends, as they fit the 5-gram."""
+
+    def order(data: SequenceData) -> tuple[int, bool]:
+        assert isinstance(data.source, Strokes)
+        return data.length, data.source.end == "observed"
+
+    return min((run.data for run in runs), key=order)
 
 
 def _describe(name: str, run: TrainedRun) -> dict[str, Any]:

@@ -38,7 +38,15 @@ from forbes.evaluation.runs import (
     require_comparable,
     split_batches,
 )
-from forbes.evaluation.scoring import PartialScores, Scorer, exact_scorer, make_scorer, score_split, with_progress
+from forbes.evaluation.scoring import (
+    PartialScores,
+    Scorer,
+    exact_scorer,
+    make_scorer,
+    require_longer,
+    score_split,
+    with_progress,
+)
 from forbes.runs.folder import RunFolder
 from forbes.runs.launched import connected, is_first, num_from_torchrun
 from forbes.runs.provenance import command_line, commit, origin
@@ -72,7 +80,9 @@ def _main(argv: Sequence[str]) -> None:
     for run, folder in folders.items():
         if folder != RunFolder(run).results:
             print(f"the results of {run} go to {folder}", flush=True)
-    if args.runs and is_agent(args.runs[0]):
+    agents = bool(args.runs) and is_agent(args.runs[0])
+    _require_no_others(args, agents)
+    if agents:
         if args.model:
             raise ForbesError(f"{args.runs[0]}: an agent is evaluated by its return, a --model has none. Name others")
         if num_from_torchrun() > 1:
@@ -97,6 +107,15 @@ def _main(argv: Sequence[str]) -> None:
         print_pairs(compare_pairs(measured))
     print_degradation(measured)
     print_images(measured)
+
+
+def _require_no_others(args: Any, agents: bool) -> None:
+    """Refuse options that would have no effect: those of scores for agents, and those of episodes for world models."""
+    of_scores = ("scores", "split", "sequences", "samples", "particles", "futures", "context", "batch_size", "data")
+    for name in of_scores if agents else ("episodes", "acting_samples"):
+        if getattr(args, name) != parser().get_default(name):
+            kind = "world models" if agents else "agents"
+            raise ForbesError(f"--{name.replace('_', '-')}: is for {kind}, and none is named. Leave it out")
 
 
 def evaluate(runs: Sequence[TrainedRun], args: Any, command: str, folders: Mapping[str, Path]) -> list[EvaluatedRun]:
@@ -239,15 +258,9 @@ def _require_same_data(runs: Sequence[TrainedRun], args: Any, count: int) -> lis
 
 
 def _require_longer(run: TrainedRun, args: Any, count: int) -> None:
-    """Refuse sequences that end within the context, since no step would be left to score."""
+    """Refuse sequences that end within the context, before minutes are spent on other scores."""
     for first, batch in split_batches(run.data, args.split, count, batch_size=500):
-        length = batch.mask.sum(1)  # (B,)
-        if (length <= args.context).any():
-            row = int(length.argmin())
-            raise ForbesError(
-                f"--context {args.context}: sequence {first + row} of the {args.split} split of {run.path} has "
-                f"{length[row]} steps, expected more. Choose a smaller context, or name other --scores"
-            )
+        require_longer(f"{run.path}, {args.split} split", first, batch, args.context)
 
 
 def _of(run: TrainedRun, jobs: Sequence[_Job]) -> list[_Job]:
@@ -272,7 +285,8 @@ def _count(run: TrainedRun, args: Any, default: int) -> int:
 
 def _round_trip(run: TrainedRun, args: Any) -> dict[str, dict[str, Any]]:
     """Measure and print the round-trip error of the flows on the first batch; return its entry, {} without flows."""
-    _, batch = next(split_batches(run.data, args.split, _count(run, args, args.batch_size), args.batch_size))
+    rows = min(args.batch_size, _count(run, args, sys.maxsize))
+    _, batch = next(split_batches(run.data, args.split, rows, rows))
     found = model_round_trip(run.model, batch, args.seed)
     print_round_trip(run.path, found)
     return (

@@ -68,6 +68,11 @@ _ALWAYS = (
         lambda barebones: not barebones,
         "false. Write less with --trainer.logger false --trainer.enable_checkpointing false",
     ),
+    _Rule(
+        "val_check_interval",
+        lambda interval: interval is None or isinstance(interval, int | float),
+        "a number of updates, or a fraction of an epoch. After a time, a resumed run would validate elsewhere",
+    ),
     _Rule("model_registry", lambda name: name is None, "null. It is for the checkpoints of Lightning's own callback"),
 )
 _OF_SEVERAL_PROCESSES = tuple(
@@ -88,6 +93,7 @@ _OF_AN_AGENT = (
     _Rule("max_steps", lambda steps: steps == -1, f"-1. {_WHOLE_EPOCHS}"),
     _Rule("max_time", lambda duration: duration is None, f"null. {_WHOLE_EPOCHS}"),
     _Rule("overfit_batches", lambda share: not share, "0. The replay of an agent grows during training"),
+    _Rule("accumulate_grad_batches", lambda batches: batches == 1, "1. Averages over updates move with every batch"),
 )
 
 

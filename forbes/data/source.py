@@ -45,6 +45,11 @@ class SequenceBatch(NamedTuple):
     ended: Tensor
     """True at the step where the process terminated (not truncated by a time limit), bool (B, T)."""
 
+    @property
+    def observed(self) -> Observed:
+        """The observations without padding, `(N, *O)`."""
+        return map_parts(lambda values: values[self.mask], self.observation)
+
     def to(self, device: torch.device | str) -> "SequenceBatch":
         """Move the batch to a device."""
         return self.each(lambda values: values.to(device))

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forbes.envs.base import Environment, Step
-from forbes.errors import ForbesError, require_one_of
+from forbes.errors import ForbesError, require_one_of, require_positive
 from forbes.pomdps import ExactBelief, FiniteBelief, GaussianMixtureBelief, Process
-from forbes.pomdps.base import require_positive
 from forbes.pomdps.hmm import FiniteProcess
 
 __all__ = ["KnownProcess", "Shown"]

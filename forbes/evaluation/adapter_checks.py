@@ -72,7 +72,7 @@ def check_model(model: BeliefModel, data: SequenceData, where: str, needs: Seque
         raise ForbesError(f"{where}: has no likelihood. Set it to what decode_state returns, e.g. forbes.Normal()")
     observation, action = batch.observation, batch.action
     _check_likelihood(model.likelihood, observation, where)
-    model.likelihood.check(observation)
+    model.likelihood.check(batch.observed)
     if isinstance(model, ModelAdapter):
         _check_methods(model, observation, action.clone(), where)
     encoded = model.encode(observation, action)

@@ -16,7 +16,7 @@ from torch import nn
 from forbes.data import SequenceData
 from forbes.errors import ForbesError
 from forbes.evaluation.adapter_checks import check_model
-from forbes.evaluation.runs import TrainedRun, load_runs
+from forbes.evaluation.runs import TrainedRun, load_runs, require_distinct
 from forbes.models import BeliefModel
 from forbes.reading import shortened
 
@@ -40,13 +40,15 @@ def load_all(
         needs: methods of the likelihood that the command needs, of `sample` and `mean`; an adapter may have none.
 
     Raises:
-        ForbesError: if there is nothing to load, a model cannot be loaded, or it fails a check.
+        ForbesError: if there is nothing to load, something is named twice, a model cannot be loaded, or it fails a
+            check.
     """
     if not models:
         if data is not None:
             raise ForbesError(f"--data {data}: is for --model; a run has data of its own. Leave it out")
     elif data is None and not paths:
         raise ForbesError("--model: on which data? Name a run first, or a configuration: --data strokes/forbes")
+    require_distinct([*paths, *(" ".join(words) for words in models)])
     runs = load_runs(paths, device)
     if models:
         source = runs[0].data if data is None else _data(data)

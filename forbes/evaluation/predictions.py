@@ -24,7 +24,14 @@ class Completions(NamedTuple):
     """Number of steps that the model saw."""
 
     def at(self, time: int) -> Tensor:
-        """Return the frames of step `time`, counted from 1 as in the paper, `(N, B, C, H, W)`."""
+        """Return the frames of step `time`, counted from 1 as in the paper, `(N, B, C, H, W)`.
+
+        Raises:
+            ForbesError: if the step was not completed: seen, or after the last.
+        """
+        last = self.context + self.frames.shape[2]
+        if not self.context < time <= last:
+            raise ForbesError(f"Completions: step {time} was not completed, expected {self.context + 1} to {last}")
         return self.frames[:, :, time - self.context - 1]
 
 

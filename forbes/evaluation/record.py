@@ -35,11 +35,12 @@ def describe(scores: Scores, metric: str) -> dict[str, Any]:
     values, steps, total = scores.values[metric], scores.steps, scores.total(metric)
     shares = {"minimum": 0.0, "5%": 0.05, "median": 0.5, "95%": 0.95, "maximum": 1.0}
     counts = scores.mask.sum(0)  # (T,)
+    last = int(counts.nonzero().max()) + 1  # later steps are padding in all sequences
     return {
         **Estimate.of(total)._asdict(),
         "interval_95": bootstrap_interval(total),
         "per_step": Estimate.per_step(values.sum(1), steps)._asdict(),
-        "curve": (values.sum(0) / counts.clamp(min=1)).tolist(),
+        "curve": (values.sum(0) / counts.clamp(min=1))[:last].tolist(),
         "quantiles": {name: total.quantile(share).item() for name, share in shares.items()},
         "sequences": len(total),
         "steps": int(steps.sum()),

@@ -98,6 +98,14 @@ def find_device(name: str) -> str:
     return chosen
 
 
+def require_distinct(paths: Sequence[str]) -> None:
+    """Raise a ForbesError for a run that is named twice: it would be compared with itself, or count as two seeds."""
+    folders = [Path(path).resolve() for path in paths]
+    for path, folder in zip(paths, folders, strict=True):
+        if folders.count(folder) > 1:
+            raise ForbesError(f"{path}: is named twice. Name each run once")
+
+
 def load_runs(paths: Sequence[str], device: str = "cpu") -> list[TrainedRun]:
     """Load runs, with their models on `device`."""
     runs = []
@@ -112,6 +120,7 @@ def recorded_runs(paths: Sequence[str]) -> list[TrainedRun]:
 
     A folder without a checkpoint is drawn too: before its first one, or after it was deleted. Its model is untrained.
     """
+    require_distinct(paths)
     runs = []
     for path in paths:
         folder = RunFolder.existing(path)
@@ -173,8 +182,8 @@ def split_batches(
     data: SequenceData, split: Split, sequences: int, batch_size: int
 ) -> Iterator[tuple[int, SequenceBatch]]:
     """Yield the first `sequences` sequences of a split in order, as batches with the index of their first sequence."""
-    for index in torch.arange(sequences).split(batch_size):
-        yield int(index[0]), data.sequences(split, index)
+    for first in range(0, sequences, batch_size):
+        yield first, data.sequences(split, torch.arange(first, min(first + batch_size, sequences)))
 
 
 def data_name(data: SequenceData) -> str:

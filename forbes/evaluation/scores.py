@@ -187,7 +187,10 @@ def score_particles(model: PosteriorModel, batch: SequenceBatch, number: int) ->
         number: number of particles, K.
     """
     encoded, fivo, ess = model.encode(batch.observation, batch.action), [], []
-    log_likelihood = partial(frame_log_prob, model)
+
+    def log_likelihood(features: Tensor, target: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        return frame_log_prob(model, features, target), {}
+
     for step in run_particles(model, encoded, number, systematic, log_likelihood, dtype=torch.float64):
         fivo.append(step.increment)  # (B,)
         ess.append(effective_sample_size(step.log_weight) / number)

@@ -21,7 +21,7 @@ from torch import Tensor
 from forbes.choices import PASSES, SUBSET
 from forbes.data import SequenceBatch, SequenceData, Split
 from forbes.distributed import num_ranks, of_all_ranks, rank
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import split_batches
 from forbes.evaluation.scores import Increments, score_open_loop, score_particles, score_predictions, score_trajectories
@@ -144,7 +144,8 @@ def evaluate(
         Mean and standard error over sequences by metric, in nats per sequence; `ess` as a fraction of K.
 
     Raises:
-        ForbesError: if a score does not exist or is not finite, or if there are fewer than two sequences.
+        ForbesError: if a score does not exist or is not finite, a number is below 1, there are fewer than two
+            sequences, or one of them ends within the context.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
@@ -155,6 +156,8 @@ def evaluate(
     """
     if unknown := [name for name in scores if name not in PASSES]:
         raise ForbesError(f"evaluate: there is no score {unknown[0]}, expected some of {', '.join(PASSES)}")
+    require_at_least(1, "evaluate", samples=samples, particles=particles, futures=futures, context=context)
+    require_at_least(1, "evaluate", batch_size=batch_size)
     count = min(sequences, data.source.size(split))
     if count < 2:
         raise ForbesError(f"evaluate: a standard error needs at least 2 sequences, found {count}. Choose more")
@@ -240,12 +243,14 @@ def score_split(
         per_rank: whether all ranks call this, and share the batches out. Each gets all scores.
 
     Raises:
-        ForbesError: if a score is not finite (names the sequence), or if the memory does not suffice for one sequence.
+        ForbesError: if a score is not finite or a sequence ends within the context (names the sequence), or if the
+            memory does not suffice for one sequence.
     """
     device = next(model.parameters()).device
     of_rank: dict[int, Scores] = {}  # by the index of the first sequence
     mine = itertools.islice(batches, rank(), None, num_ranks()) if per_rank else batches
     for first, batch in mine:
+        require_longer(where, first, batch, score.context)
         values = parts.read(first) if parts else None
         if values is None:
             values = _score(model, first, batch.to(device), score, seed, where)
@@ -284,6 +289,17 @@ def _score(model: BeliefModel, first: int, batch: SequenceBatch, score: Scorer, 
 def _out_of_memory(error: RuntimeError) -> bool:
     """Return whether torch ran out of memory. On the CPU there is no exception class for it."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+
+
+def require_longer(where: str, first: int, batch: SequenceBatch, context: int) -> None:
+    """Raise a ForbesError that names a sequence, counted from `first`, that ends within the context."""
+    length = batch.mask.sum(1)  # (B,)
+    row = int(length.argmin())
+    if length[row] <= context:
+        raise ForbesError(
+            f"{where}: sequence {first + row} has {length[row]} steps, expected more than the context of {context}. "
+            "Choose a smaller context, or other scores"
+        )
 
 
 def require_finite(where: str, first: int, scores: Increments) -> None:

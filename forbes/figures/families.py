@@ -55,11 +55,14 @@ def group(runs: Sequence[TrainedRun]) -> list[RunFamily]:
 
 
 def require_same_data(runs: Sequence[TrainedRun]) -> None:
-    """Require that all runs have the same test sequences and likelihood.
+    """Require that all runs have the same test sequences, at least one, and the same likelihood.
 
     Raises:
-        ForbesError: if two runs differ; names them.
+        ForbesError: if a run has no test sequences, or two runs differ; names them.
     """
+    for run in runs:
+        if not run.data.source.size("test"):
+            raise ForbesError(f"{run.path}: its data have no test split, from which sequences are drawn. Name others")
     counts = [min(_COMPARED, run.data.source.size("test")) for run in runs]
     require_comparable(runs, [data_sha256(run.data, "test", count) for run, count in zip(runs, counts, strict=True)])
 

@@ -49,8 +49,6 @@ def draw_predictions(
     trained = load_all(runs, model, data, needs=("sample", "mean"))
     for run in trained:
         require_only_images(run.path, run.data.observation_shape, "Name runs of images, e.g. of strokes")
-        if not run.data.source.size("test"):
-            raise ForbesError(f"{run.path}: its data have no test split, from which sequences are drawn. Name others")
         if mean and not run.data.source.increments:
             raise ForbesError(f"--mean: the frames of {run.path} are expectations anyway, not sampled. Leave it out")
     require_same_data(trained)
@@ -116,20 +114,19 @@ def predictions(
 def ambiguous_digits(data: SequenceData, context: int, candidates: int = 500, neighbours: int = 50) -> Tensor:
     """Return test digits with an ambiguous beginning, independent of any model: `(classes,)`, int64.
 
-    For each class it is the digit among the first `candidates` whose nearest training digits, by the blurred frame
-    t = `context`, have the highest entropy of labels.
+    For each class it is the digit, of those among the first `candidates` with more than `context` steps, whose nearest
+    training digits, by the blurred frame t = `context`, have the highest entropy of labels.
     """
     source = data.source
     assert isinstance(source, Strokes)
-    labels, test_labels = source.labels("train"), source.labels("test")[:candidates]
-    index = torch.arange(len(test_labels))
+    index = torch.nonzero(source.steps("test")[:candidates] > context)[:, 0]  # (N,)
+    labels, test_labels = source.labels("train"), source.labels("test")[index]
     test = source.pictures(data.sequences("test", index, context).observation)  # (N, T, C, H, W)
     nearest = TrainingPrefixes(data, context, last_frame).nearest(test, neighbours)  # (N, neighbours)
     counts = torch.nn.functional.one_hot(labels[nearest], 10).sum(1).double()  # (N, 10)
     entropy = torch.special.entr(counts / counts.sum(1, keepdim=True)).sum(1)  # (N,)
-    return torch.stack(
-        [
-            torch.where(test_labels == label, entropy, -1).argsort(descending=True, stable=True)[0]
-            for label in test_labels.unique()
-        ]
-    )
+    most = [
+        torch.where(test_labels == label, entropy, -1).argsort(descending=True, stable=True)[0]
+        for label in test_labels.unique()
+    ]
+    return index[torch.stack(most)]

@@ -66,7 +66,8 @@ def elbo_loss(
     Args:
         terms: the parts of the bound.
         free_nats: n, in nats per step.
-        free_nats_per: "batch" averages first (Dreamer, ours), "element" clips each step (PlaNet).
+        free_nats_per: "batch" averages first (Dreamer, ours), "element" clips each step (PlaNet), which is meant for
+            a KL in closed form: of samples, E max(KL_t, n) is not max(E KL_t, n).
         kl_weight: :math:`\beta`, 1 except during a warm-up.
 
     Returns:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torch.nn.functional import log_softmax, one_hot, pad, softplus
 
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_positive
 from forbes.performance.fusion import fused
 from forbes.shapes import Observed
 from forbes.symlog import symexp, symlog
@@ -26,7 +26,7 @@ class Likelihood(ABC):
     """Dimensions of an observation: 3 of an image `(C, H, W)`, 1 of a vector `(O,)`."""
 
     def check(self, observation: Observed) -> None:  # noqa: B027  # most likelihoods take any value
-        """Raise a ForbesError where stored observations `(*, *O)` have a value outside the density's support."""
+        """Raise a ForbesError where stored observations `(*, *O)`, without padding, are outside the support."""
 
     @abstractmethod
     def target(self, observation: Observed) -> Tensor:
@@ -182,7 +182,8 @@ class Normal(_FixedStd):
         bits: b; 5 in PlaNet and the paper, all 8 in Dreamer.
 
     Raises:
-        ForbesError: when `bits` is not of 1 to 8, or below 8 for another scale than 255.
+        ForbesError: when `std` or `scale` is not above 0, or `bits` not of 1 to 8, or below 8 for another scale than
+            255.
 
     Example:
         >>> likelihood = forbes.Normal(std=0.5)
@@ -196,6 +197,7 @@ class Normal(_FixedStd):
     def __init__(self, std: float = 1.0, scale: float = 255.0, bits: int = 8) -> None:
         if not 1 <= bits <= 8 or (bits < 8 and scale != 255):
             raise ForbesError(f"Normal: bits is {bits} at scale {scale:g}, expected 1 to 8 of bytes, scale 255")
+        require_positive("Normal", std=std, scale=scale)
         self.std, self.scale, self.bits = std, scale, bits
         own = [f"scale={scale:g}"] * (scale != 255) + [f"bits={bits}"] * (bits != 8)
         self.name = f"normal({','.join([f'{std:g}', *own])})"
@@ -223,6 +225,9 @@ class VectorNormal(_FixedStd):
     Args:
         std: :math:`\sigma`; the sensor's, where it is known.
 
+    Raises:
+        ForbesError: when `std` is not above 0.
+
     Example:
         >>> likelihood = forbes.VectorNormal(std=0.1)
         >>> target = likelihood.target(torch.ones(5, 3))
@@ -233,6 +238,7 @@ class VectorNormal(_FixedStd):
     rank = 1
 
     def __init__(self, std: float = 1.0) -> None:
+        require_positive("VectorNormal", std=std)
         self.std = std
         self.name = f"normal({std:g})"
 
@@ -257,6 +263,9 @@ class SymlogNormal(_FixedStd):
     Args:
         std: :math:`\sigma`; 1 in DreamerV3.
 
+    Raises:
+        ForbesError: when `std` is not above 0.
+
     Example:
         >>> likelihood = forbes.SymlogNormal()
         >>> target = likelihood.target(torch.ones(5, 3))
@@ -267,6 +276,7 @@ class SymlogNormal(_FixedStd):
     rank = 1
 
     def __init__(self, std: float = 1.0) -> None:
+        require_positive("SymlogNormal", std=std)
         self.std = std
         self.name = f"symlog-normal({std:g})"
 
@@ -298,6 +308,14 @@ class OneHot(Likelihood):
     """
 
     name, rank = "categorical", 1
+
+    def check(self, observation: Tensor) -> None:
+        """See `Likelihood.check`: one 1, and 0 elsewhere."""
+        if not (((observation == 0) | (observation == 1)).all() and (observation.sum(-1) == 1).all()):
+            raise ForbesError(
+                "OneHot: observations are not one-hot, expected one 1 and 0 elsewhere. Use VectorNormal as "
+                "model.likelihood"
+            )
 
     def target(self, observation: Tensor) -> Tensor:
         """See `Likelihood.target`: as they are."""

@@ -14,13 +14,13 @@ resampled, h and s jointly; `torch.where` decides, so shapes never depend on val
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
-from forbes.errors import ForbesError, require_at_least
+from forbes.errors import ForbesError, require_at_least, require_one_of
 from forbes.frozen import frozen
 from forbes.models.base import EncodedSequence, FrameLogProb, ModelParts, State
 from forbes.models.elbo import KL, ElboTerms
@@ -53,6 +53,8 @@ class Particles(NamedTuple):
     """log p(o_t | h_t, s_t) in nats, `(K, B)`."""
     increment: Tensor
     """What the step adds to the bound, log p̂_t in nats, `(B,)`."""
+    parts: Mapping[str, Tensor]
+    """The log-likelihood of each part of an observation of several, `(K, B)` each."""
 
 
 def effective_sample_size(log_weight: Tensor) -> Tensor:
@@ -101,12 +103,15 @@ def soft(log_weight: Tensor) -> tuple[Tensor, Tensor]:
     return ancestor, (log_weight - mixed).gather(0, ancestor) - math.log(number)
 
 
+_RESAMPLING: Mapping[str, Resampling] = {"systematic": systematic, "soft": soft}
+
+
 def run_particles(
     model: PosteriorModel,
     encoded: EncodedSequence,
     number: int,
     resampling: Resampling,
-    log_likelihood: Callable[[Tensor, Tensor], Tensor],
+    log_likelihood: Callable[[Tensor, Tensor], tuple[Tensor, Mapping[str, Tensor]]],
     dtype: torch.dtype,
 ) -> Iterator[Particles]:
     """Filter a sequence with K particles and give them step by step, so that only one step need be held.
@@ -116,7 +121,8 @@ def run_particles(
         encoded: B sequences of T steps.
         number: K.
         resampling: `systematic` or `soft`.
-        log_likelihood: log p(o_t | features), of features `(K, B, H + D)` and o_t `(B, *O)`, to `(K, B)`.
+        log_likelihood: log p(o_t | features), of features `(K, B, H + D)` and o_t `(B, *O)`, to `(K, B)`, and that of
+            each part.
         dtype: of the weights.
     """
     sequences, steps = encoded.embedding.shape[:2]
@@ -129,12 +135,12 @@ def run_particles(
         with full_precision(encoded.embedding):
             moved = step(carried)
         features = moved.features.view(*stay.shape, -1)  # (K, B, H + D)
-        reconstruction = log_likelihood(features, encoded.target[:, t])
+        reconstruction, parts = log_likelihood(features, encoded.target[:, t])
         divergence = (moved.log_prob - model.prior_log_prob(moved)).view(stay.shape)  # (K, B)
         joint = log_before + reconstruction - divergence
         increment = joint.logsumexp(0)  # (B,)
         log_weight = joint - increment
-        yield Particles(moved, log_before, log_weight, reconstruction, increment)
+        yield Particles(moved, log_before, log_weight, reconstruction, increment, parts)
         again = effective_sample_size(log_weight) < number / 2  # (B,)
         ancestor, log_child = resampling(log_weight)
         carried = _choose(moved, torch.where(again, ancestor, stay))
@@ -152,7 +158,8 @@ def sample_weighted_beliefs(model: PosteriorModel, encoded: EncodedSequence, num
         encoded: B sequences of T steps.
         number: K.
     """
-    return _draw_last(run_particles(model, encoded, number, systematic, model.log_likelihood, torch.float64), 1)
+    steps = run_particles(model, encoded, number, systematic, model.log_likelihood_by_part, torch.float64)
+    return _draw_last(steps, 1)
 
 
 def _draw_last(steps: Iterator[Particles], samples: int) -> State:
@@ -181,6 +188,9 @@ class ParticleModel(StateSpaceModel):
         particles: number of particles, K.
         resampling: "systematic"; or "soft", which lets gradients pass through the weights of the resampled particles.
 
+    Raises:
+        ForbesError: when K is below 1, or `resampling` is another word.
+
     Example:
         >>> parts = forbes.ModelParts(
         ...     belief=forbes.GaussianBelief, encoder=forbes.MLPEncoder((3,)), decoder=forbes.MLPDecoder(20, (3,)),
@@ -196,8 +206,9 @@ class ParticleModel(StateSpaceModel):
     ) -> None:
         super().__init__(parts)
         require_at_least(1, "ParticleModel", particles=particles)
+        require_one_of(_RESAMPLING, "ParticleModel", resampling=resampling)
         self.particles = particles
-        self.resampling: Resampling = {"systematic": systematic, "soft": soft}[resampling]
+        self.resampling = _RESAMPLING[resampling]
 
     @property
     def bound_name(self) -> str:
@@ -215,9 +226,14 @@ class ParticleModel(StateSpaceModel):
         increment = torch.stack([step.increment for step in steps], 1)  # (B, T)
         if kl == "path" and self.posterior.reparameterised:
             increment = increment + self._double_reparameterisation(steps, encoded)
-        weighted = [(step.log_weight.exp() * step.log_likelihood).sum(0) for step in steps]
-        reconstruction = torch.stack(weighted, 1)  # (B, T)
-        return ElboTerms(reconstruction, kl=reconstruction - increment, analytic_kl=None, mask=mask)
+
+        def weighted(values: Iterator[Tensor]) -> Tensor:
+            means = [(step.log_weight.exp() * each).sum(0) for step, each in zip(steps, values, strict=True)]
+            return torch.stack(means, 1)  # (B, T)
+
+        reconstruction = weighted(step.log_likelihood for step in steps)
+        parts = {name: weighted(step.parts[name] for step in steps) for name in steps[0].parts}
+        return ElboTerms(reconstruction, reconstruction - increment, analytic_kl=None, mask=mask, parts=parts)
 
     def _double_reparameterisation(self, steps: Sequence[Particles], encoded: EncodedSequence) -> Tensor:
         r"""Return zeros, `(B, T)`; added to log p̂_t, they replace a noisy part of its gradient by one of equal mean.
@@ -270,5 +286,5 @@ class ParticleModel(StateSpaceModel):
 
     def _run(self, encoded: EncodedSequence) -> Iterator[Particles]:
         return run_particles(
-            self, encoded, self.particles, self.resampling, self.log_likelihood, dtype=encoded.embedding.dtype
+            self, encoded, self.particles, self.resampling, self.log_likelihood_by_part, dtype=encoded.embedding.dtype
         )

@@ -2,15 +2,19 @@
 
 from collections.abc import Mapping
 
+import torch
+
+from forbes.beliefs import CategoricalBelief
 from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel
-from forbes.models.elbo import KL
+from forbes.models.elbo import KL, FreeNats
 from forbes.models.likelihoods import Likelihood, Normal, VectorNormal
+from forbes.models.particles import ParticleModel
 from forbes.models.parts import PartsLikelihood
 from forbes.models.state_space import StateSpaceModel
 from forbes.shapes import Shape
 
-__all__ = ["likelihood_for", "require_mean", "require_path"]
+__all__ = ["likelihood_for", "require_closed_form", "require_mean", "require_path", "require_same_states"]
 
 
 def require_path(kl: KL, model: BeliefModel) -> None:
@@ -24,6 +28,44 @@ def require_path(kl: KL, model: BeliefModel) -> None:
         raise ForbesError(
             f"WorldModel: kl is path, but the draws of a {name} are not reparameterised, expected analytic or "
             "monte_carlo. Leave kl out"
+        )
+
+
+def require_same_states(model: BeliefModel) -> None:
+    """Raise a ForbesError if prior and posterior are not over the same states, so that they have no KL."""
+    if not isinstance(model, StateSpaceModel):
+        return
+    posterior, prior = (
+        f"one-hot variables of {head.classes} classes" if isinstance(head, CategoricalBelief) else "real vectors"
+        for head in (model.posterior, model.prior)
+    )
+    if posterior != prior:
+        raise ForbesError(
+            f"WorldModel: the states of the belief are {posterior}, those of the prior {prior}, expected the same. "
+            "Leave prior out, or choose another"
+        )
+
+
+def require_closed_form(kl: KL, free_nats_per: FreeNats, model: BeliefModel) -> None:
+    """Raise a ForbesError if an option is asked for that needs the KL in closed form, and the model has none."""
+    if not isinstance(model, StateSpaceModel):
+        return
+    context = torch.zeros(1, model.posterior.context_dim)  # (1, C)
+    if (
+        kl == "analytic"
+        and not isinstance(model, ParticleModel)
+        and model.posterior.kl(context, model.prior, context) is not None
+    ):
+        return
+    if free_nats_per == "element":
+        raise ForbesError(
+            "WorldModel: free_nats_per is element, but the KL is estimated by samples, and to clip these gives another "
+            "loss, expected batch. Leave free_nats_per out"
+        )
+    if isinstance(model.posterior, CategoricalBelief) and model.posterior.kl_weights is not None:
+        raise ForbesError(
+            "WorldModel: kl_balance weighs the gradients of the KL in closed form, but the KL is estimated by samples. "
+            "Leave kl_balance out, or use kl: analytic with a StateSpaceModel"
         )
 
 

@@ -1,17 +1,23 @@
 """The arguments of a world model and of its training, and the belief model that they describe."""
 
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import torch
 from torch import nn
 
 from forbes.beliefs import BeliefFamily, FlowBelief
-from forbes.errors import require_at_least
+from forbes.errors import require_at_least, require_one_of
 from forbes.models.base import ModelFamily, ModelParts
 from forbes.models.elbo import KL, FreeNats
 from forbes.models.likelihoods import Likelihood, Normal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
-from forbes.models.requirements import likelihood_for, require_mean, require_path
+from forbes.models.requirements import (
+    likelihood_for,
+    require_closed_form,
+    require_mean,
+    require_path,
+    require_same_states,
+)
 from forbes.models.state_space import StateSpaceModel
 from forbes.shapes import Shape, size_of
 
@@ -44,7 +50,8 @@ class World(nn.Module):
             "path": at the posterior's sample, through the sample alone. "monte_carlo": through the posterior's
             parameters too; this noise costs a flow thousands of updates. Of a `ParticleModel`, "analytic" is this.
         free_nats: the KL below this, in nats per step, costs nothing in training.
-        free_nats_per: "batch" applies them to the mean over batch and time, "element" to each step.
+        free_nats_per: "batch" applies them to the mean over batch and time, "element" to each step, for a KL in closed
+            form.
         kl_warmup: updates over which the weight of the KL rises from 0 to 1.
         learning_rate: learning rate of Adam (eps 1e-7).
         schedule: "constant", or "cosine" to 0 at the end of the training.
@@ -55,8 +62,8 @@ class World(nn.Module):
         seed: random seed of the noise of training and validation.
 
     Raises:
-        ForbesError: when a size is below 1, the learning rate or `clip_norm` below 0, or `likelihood` or `center` does
-            not fit the other arguments.
+        ForbesError: when a size is below 1, another number below 0, a choice does not exist, or `likelihood`, `prior`,
+            `kl`, `free_nats_per` or `center` does not fit the other arguments.
     """
 
     def __init__(
@@ -89,6 +96,11 @@ class World(nn.Module):
         self.learning_rate, self.seed, self.schedule, self.warmup = learning_rate, seed, schedule, warmup
         require_at_least(1, "WorldModel", hidden_dim=hidden_dim, mlp_dim=mlp_dim, mlp_layers=mlp_layers)
         require_at_least(0, "WorldModel", state_dim=state_dim, learning_rate=learning_rate, clip_norm=clip_norm)
+        require_at_least(0, "WorldModel", free_nats=free_nats, kl_warmup=kl_warmup, warmup=warmup)
+        require_one_of(get_args(KL), "WorldModel", kl=kl)
+        require_one_of(get_args(FreeNats), "WorldModel", free_nats_per=free_nats_per)
+        require_one_of(get_args(Schedule), "WorldModel", schedule=schedule)
+        require_one_of(get_args(Activation), "WorldModel", activation=activation)
         likelihood = likelihood_for(observation_shape, likelihood or Normal())
         self.model = model(
             ModelParts(
@@ -104,7 +116,9 @@ class World(nn.Module):
                 mlp_layers=mlp_layers,
             )
         )
+        require_same_states(self.model)
         require_path(kl, self.model)
+        require_closed_form(kl, free_nats_per, self.model)
         self.activation: Activation = activation
         activate(self.model, activation)
         if center:

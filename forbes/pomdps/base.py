@@ -9,13 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_positive
 from forbes.named import Named
 from forbes.pomdps.beliefs import ExactBelief, GaussianMixtureBelief
 from forbes.pomdps.distributions import Distribution
 from forbes.shapes import printed_by_shape
 
-__all__ = ["AffineGaussian", "ExactFilter", "Process", "Trajectories", "require_positive"]
+__all__ = ["AffineGaussian", "ExactFilter", "Process", "Trajectories"]
 
 
 @printed_by_shape
@@ -198,10 +198,3 @@ def _require_sequences(where: str, values: Tensor, dim: int) -> None:
         raise ForbesError(
             f"{where} of sequence {sequence} at step {step} is {value}, expected finite numbers. Leave the sequence out"
         )
-
-
-def require_positive(where: str, **numbers: float) -> None:
-    """Raise a ForbesError unless every number is above 0."""
-    for name, number in numbers.items():
-        if not number > 0:
-            raise ForbesError(f"{where}: {name} is {number}, expected more than 0. Choose another")

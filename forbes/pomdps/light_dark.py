@@ -5,7 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from forbes.pomdps.base import ExactFilter, Process, require_positive
+from forbes.errors import require_positive
+from forbes.pomdps.base import ExactFilter, Process
 from forbes.pomdps.beliefs import GridBelief
 from forbes.pomdps.distributions import DiagonalGaussian, PointMass
 from forbes.pomdps.grid import Grid, require_inside

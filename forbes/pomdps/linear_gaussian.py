@@ -5,7 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from forbes.pomdps.base import AffineGaussian, ExactFilter, Process, require_positive
+from forbes.errors import require_positive
+from forbes.pomdps.base import AffineGaussian, ExactFilter, Process
 from forbes.pomdps.distributions import DiagonalGaussian
 from forbes.pomdps.kalman import LinearSystem, kalman_filter, smoothing_conditional
 

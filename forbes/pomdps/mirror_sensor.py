@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from forbes.pomdps.base import ExactFilter, Process, require_positive
+from forbes.errors import require_positive
+from forbes.pomdps.base import ExactFilter, Process
 from forbes.pomdps.distributions import DiagonalGaussian
 from forbes.pomdps.grid import Grid, grid_filter
 

@@ -6,8 +6,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from forbes.errors import require_one_of
-from forbes.pomdps.base import AffineGaussian, ExactFilter, Process, require_positive
+from forbes.errors import require_one_of, require_positive
+from forbes.pomdps.base import AffineGaussian, ExactFilter, Process
 from forbes.pomdps.beliefs import GaussianMixtureBelief
 from forbes.pomdps.distributions import DiagonalGaussian, draw_normal
 from forbes.pomdps.kalman import LinearSystem, kalman_filter, smoothing_conditional

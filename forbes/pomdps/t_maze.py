@@ -4,8 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from forbes.errors import ForbesError
-from forbes.pomdps.base import require_positive
+from forbes.errors import ForbesError, require_positive
 from forbes.pomdps.hmm import FiniteProcess
 
 __all__ = ["TMaze"]

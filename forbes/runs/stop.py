@@ -1,5 +1,6 @@
 """A clean stop: on a signal a training ends with a checkpoint from which it can resume."""
 
+import math
 import os
 import signal
 from types import FrameType
@@ -58,7 +59,7 @@ class StopOnSignal(Callback):
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         """End the loop after this update, unless a validation follows, which must be completed."""
         updates = (batch_idx + 1) % trainer.accumulate_grad_batches == 0  # a checkpoint has no half-summed gradients
-        if updates and not trainer.is_last_batch and not self._whole_epochs:
+        if updates and not _validation_follows(trainer, batch_idx) and not self._whole_epochs:
             self._end(trainer)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -87,3 +88,9 @@ class StopOnSignal(Callback):
         if received := greatest(self.received or 0, trainer.strategy.root_device):
             self.received = received
             cast(Any, trainer)._signal_connector.received_sigterm = True
+
+
+def _validation_follows(trainer: Trainer, batch_idx: int) -> bool:
+    """Return whether Lightning may validate after this batch: at the end of an epoch, or every `val_check_interval`."""
+    number = trainer.fit_loop.total_batch_idx if trainer.check_val_every_n_epoch is None else batch_idx
+    return trainer.is_last_batch or (number + 1) % (trainer.val_check_batch or math.inf) == 0

@@ -69,7 +69,8 @@ class ImaginationActorCritic(WorldModelAgent):
         **acting: arguments of `WorldModelAgent` and `WorldModel`, whose learning rate is that of model and reward.
 
     Raises:
-        ForbesError: when N or a size is below 1, H below 2, `slow_critic` not in [0, 1], or the data have no actions.
+        ForbesError: when N or a size is below 1, H below 2, `discount`, `lambda_` or `slow_critic` not in [0, 1], or
+            the data have no actions.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Experience("mountain_hike"), length=30, batch_size=20)
@@ -102,10 +103,11 @@ class ImaginationActorCritic(WorldModelAgent):
         require_at_least(1, name, trajectories=trajectories, actor_layers=actor_layers, critic_layers=critic_layers)
         require_at_least(2, name, horizon=horizon)
         require_at_least(0, name, actor_rate=actor_rate, critic_rate=critic_rate, actor_entropy=actor_entropy)
+        for shared, value in (("discount", discount), ("lambda_", lambda_), ("slow_critic", slow_critic)):
+            if not 0 <= value <= 1:
+                raise ForbesError(f"{name}: {shared} is {value}, expected 0 to 1")
         if not actor_min_std > 0:
             raise ForbesError(f"{name}: actor_min_std is {actor_min_std}, expected a number above 0. 1e-4 is Dreamer's")
-        if not 0 <= slow_critic <= 1:
-            raise ForbesError(f"{name}: slow_critic is {slow_critic}, expected 0 to 1. 0.02 is DreamerV3's")
         features = self.model.hidden_dim + self.model.state_dim
         self.actor = Actor(features, self.model.action_dim, control_dim, actor_layers, self.discrete, actor_min_std)
         self.critic = self.scalar_head(features, control_dim, critic_layers)

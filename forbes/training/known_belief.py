@@ -6,15 +6,14 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from forbes.beliefs import BeliefFamily
+from forbes.beliefs import BeliefFamily, CategoricalBelief
 from forbes.data import SequenceBatch, SequenceDataModule, Simulated
 from forbes.distributed import mean_over_ranks, shared_batch
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_positive
 from forbes.models.elbo import elbo_loss
 from forbes.models.known_model import KnownModel, Standardizer
 from forbes.performance.precision import full_precision
 from forbes.pomdps import FiniteBelief, Process
-from forbes.pomdps.base import require_positive
 from forbes.pomdps.distributions import PointMass
 from forbes.seeding import generator
 from forbes.training.seeded import SeededModule
@@ -51,8 +50,8 @@ class KnownBelief(SeededModule):
         seed: random seed of the noise of training and validation.
 
     Raises:
-        ForbesError: when the data are of another process, the process lacks a density that the objective needs, or a
-            size or the rate is not above 0.
+        ForbesError: when the data are of another process, the process lacks a density that the objective needs, the
+            family has none, or a size or the rate is not above 0.
 
     Example:
         >>> process = forbes.MirrorSensor()
@@ -87,6 +86,8 @@ class KnownBelief(SeededModule):
         inputs = torch.cat((observation, action), -1)  # (N, T, O + A)
         units = Standardizer(state.flatten(0, 1)), Standardizer(inputs.flatten(0, 1))
         self.model = KnownModel(process, belief, *units, hidden_dim, mlp_dim, mlp_layers)
+        if isinstance(self.model.head, CategoricalBelief):
+            raise ForbesError("KnownBelief: a CategoricalBelief has no density. Use another family")
 
     @property
     def objective_name(self) -> str:

@@ -134,7 +134,7 @@ class WorldModel(World, SeededModule):
         """Seed the noise of this batch; check the first observations of an epoch; measure the mean observation."""
         super().on_train_batch_start(batch, batch_idx)
         if batch_idx == 0:
-            self.model.likelihood.check(batch.observation)
+            self.model.likelihood.check(batch.observed)
         if self.model.center is not None and self.batches_before == 0:
             observed = self.model.likelihood.target(batch.observation)[batch.mask]  # (N, *O)
             with shared_batch():

@@ -17,6 +17,7 @@ from forbes.beliefs import (
     GaussianBelief,
     MixtureBelief,
 )
+from forbes.errors import ForbesError
 from forbes.performance.time_loop import TimeLoop
 
 CONTEXT = 3
@@ -299,3 +300,18 @@ def test_a_time_loop_compiles_to_one_graph(family):
         results.append(torch.autograd.grad(form(), list(head.parameters())))
 
     torch.testing.assert_close(results[0], results[1])
+
+
+@pytest.mark.parametrize(
+    ("family", "options", "message"),
+    [
+        (GaussianBelief, {"min_std": -5.0}, "min_std is -5.0, expected at least 0"),
+        (MixtureBelief, {"min_std": -5.0}, "min_std is -5.0, expected at least 0"),
+        (FlowBelief, {"min_std": -5.0}, "min_std is -5.0, expected at least 0"),
+        (MixtureBelief, {"components": 0}, "components is 0, expected at least 1"),
+        (FlowBelief, {"coupling": "realnvp"}, "coupling is 'realnvp', expected affine or spline"),
+    ],
+)
+def test_a_number_or_word_without_a_meaning_is_refused(family, options, message):
+    with pytest.raises(ForbesError, match=message):
+        family(2, CONTEXT, **options)

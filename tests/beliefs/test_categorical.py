@@ -99,6 +99,10 @@ def test_refuses_a_balance_outside_0_to_1(balance):
         CategoricalBelief(12, CONTEXT, 4, kl_balance=balance)
 
 
+def test_both_weights_may_be_a_list_as_in_a_configuration():
+    assert CategoricalBelief(12, CONTEXT, 4, kl_balance=[1, 0.1]).kl_weights == (1, 0.1)
+
+
 @pytest.mark.parametrize("mix", [0.01, 0.5])
 def test_a_uniform_mix_is_that_of_the_probabilities(mix):
     belief, context = CategoricalBelief(12, CONTEXT, 4, uniform_mix=mix).double(), contexts(5)
@@ -136,5 +140,7 @@ def test_other_families_or_classes_have_no_closed_form():
 
 
 def test_refuses_a_state_that_is_not_made_of_whole_variables():
+    with pytest.raises(ForbesError, match="classes is 0, expected at least 1"):
+        CategoricalBelief(12, CONTEXT, 0)
     with pytest.raises(ForbesError, match="state_dim is 30, expected a multiple of classes, 32"):
         CategoricalBelief(30, CONTEXT)

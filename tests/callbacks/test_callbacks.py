@@ -13,6 +13,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
+from small_agents import fit, write_image_config
 
 from forbes.callbacks import BeliefPlot, ElboCurve, PredictionGrid
 from forbes.callbacks.belief_plot import _kernel_density, _principal_plane
@@ -198,6 +199,19 @@ def test_a_context_that_leaves_nothing_to_predict_is_refused(tiny_config, tmp_pa
     assert main(["fit", "--config", str(tiny_config), "--config", str(config), "--run_dir", run]) == 2
     assert "context is 6, expected less than the length 6" in capsys.readouterr().err
     assert not RunFolder(run).checkpoint.exists()
+
+
+def test_a_state_of_one_dimension_has_no_plane(tiny_config, callbacks, tmp_path, capsys):
+    flags = ["--model.belief", "GaussianBelief", "--model.state_dim", "1", "--run_dir", str(tmp_path / "run")]
+    assert main(["fit", "--config", str(tiny_config), "--config", str(callbacks), *flags]) == 2
+    assert "BeliefPlot: state_dim is 1, expected at least 2. Remove this callback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("callback", ["ElboCurve", "PredictionGrid", "BeliefPlot"])
+def test_an_agent_has_no_validation_split_to_draw(callback, tmp_path, capsys):
+    config = write_image_config(tmp_path, f"{{class_path: {callback}}}")
+    assert fit("--config", config, "--run_dir", tmp_path / "run") == 2
+    assert f"{callback}: the data have no validation split, from which it draws" in capsys.readouterr().err
 
 
 def test_a_belief_in_the_plane_is_drawn_with_its_exact_density(tiny_run):

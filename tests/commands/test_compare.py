@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from jobs_in_this_process import configuration_here, run_here
+from small_agents import forbes, write_config
 
 from forbes.commands import compare as compare_command
 from forbes.commands import trainings
@@ -305,7 +306,9 @@ def test_what_could_not_be_compared_is_refused_before_it_is_trained(configs, tmp
     shorter = tmp_path / "shorter.yaml"
     shorter.write_text(Path(configs[0]).read_text().replace("length: 6", "length: 5"))
 
-    assert "--context 100: sequence 2 of the test split of" in error_of(*configs, *MEASURES, "--context", "100")
+    assert "sequence 2 has 5 steps, expected more than the context of 100" in error_of(
+        *configs, *MEASURES, "--context", "100"
+    )
     assert "shorter.yaml: its data are" in error_of(*configs, str(shorter), *MEASURES)
     assert not (tmp_path / "out").exists()
 
@@ -324,3 +327,28 @@ def test_what_is_wrong_is_said_in_one_sentence(configs, compared, families, tmp_
     assert "no_such_key" in error_of(configs[0], "--", "--model.no_such_key", "1")
     with pytest.raises(Exception, match=r"rssm-0: evaluation.json has no test/bleu"):
         compare(families, ["test/bleu"])
+
+
+def test_agents_are_compared_by_their_returns(tmp_path, capsys):
+    """They have no held-out sequences: the comparison ended with an error after all trainings."""
+    configs = [str(write_config(tmp_path, kind)) for kind in ("dreamer", "forbes")]
+    compare = ["compare", *configs, "--seeds", "2", "-o", str(tmp_path / "runs")]
+
+    assert forbes(*compare, *ONE_EPOCH) == 0
+
+    printed = capsys.readouterr().out
+    assert "return" in printed
+    for run in ("dreamer-0", "dreamer-1", "forbes-0", "forbes-1"):
+        assert any(name.startswith("return") for name in read_record(tmp_path / "runs" / run))
+
+
+def test_what_cannot_be_compared_is_refused_before_any_training(configs, tmp_path, capsys):
+    agent = str(write_config(tmp_path))
+    refused = {
+        "an agent is compared by its return, a world model by its scores": [configs[0], agent],
+        "Use forbes beliefs": ["pomdp/linear_gaussian/known_gaussian"],
+    }
+    for sentence, named in refused.items():
+        assert forbes("compare", *named, "-o", str(tmp_path / "runs")) == 2
+        assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()

@@ -1,9 +1,11 @@
 """`forbes completions`, as a user calls it, and its pictures."""
 
 import hashlib
+import itertools
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -13,6 +15,8 @@ import torch
 from command_line import error_of
 
 from forbes.commands.cli import main
+from forbes.commands.completions import _shared_data
+from forbes.data import SequenceDataModule, Strokes
 from forbes.data.strokes import classifiers
 from forbes.figures.completions import by_ambiguity
 from forbes.figures.grids import Bars, Panel, draw_bands, draw_panels
@@ -51,10 +55,21 @@ def test_runs_of_other_lengths_and_with_observed_ends_complete_the_same_digits(r
     assert main(["fit", "--config", str(tiny_config), "--run_dir", longer, *longer_digits]) == 0
 
     assert main(["completions", longer, runs[0], *NUMBERS, "-o", str(tmp_path / "figures")]) == 0
-
     scores = pd.read_csv(tmp_path / "figures" / "completions.csv")
     assert {name.partition("<=")[2] for name in scores["metric"] if "<=" in name} == {f"{length}]"}
     assert scores[scores["minus"].notna()]["run"].unique().tolist() == [longer]
+
+
+def test_the_order_of_runs_does_not_change_the_reference(strokes_file):
+    """The 5-gram is fitted on the shortest sequences, with masked ends if a run has them."""
+    sources = [Strokes(path=str(strokes_file), end=end) for end in ("observed", "masked", "observed")]
+    runs = [
+        SimpleNamespace(data=SequenceDataModule(source, length=length))
+        for source, length in zip(sources, (6, 6, 9), strict=True)
+    ]
+
+    for ordered in itertools.permutations(runs):
+        assert _shared_data(ordered) is runs[1].data
 
 
 def test_the_record_says_what_was_measured_and_how(completed, runs):

@@ -91,6 +91,10 @@ def test_python_gives_the_numbers_that_the_command_records(runs):
     [
         ({"scores": ["elbow"]}, "there is no score elbow, expected some of elbo, pll, fivo, open-loop"),
         ({"sequences": 1}, "a standard error needs at least 2 sequences, found 1"),
+        ({"samples": 0}, "samples is 0, expected at least 1"),
+        ({"scores": ["open-loop"], "context": 0}, "context is 0, expected at least 1"),
+        ({"scores": ["open-loop"], "context": 5}, "sequence 2 has 5 steps, expected more than the context of 5"),
+        ({"scores": ["open-loop"], "context": 99}, "expected more than the context of 99"),
     ],
 )
 def test_a_score_that_cannot_be_had_in_python_is_one_sentence(runs, options, sentence):
@@ -221,6 +225,17 @@ def test_a_score_that_a_model_does_not_have_is_left_out_and_said(runs, other_fil
     with torch.no_grad():
         log_p = module.model.lower_bound(batch.observation, batch.action, batch.mask).elbo
     np.testing.assert_allclose(arrays_of(vector)["test[:5]/pll[bernoulli,K=4]"], log_p.numpy(), rtol=1e-6)
+
+
+def test_one_sequence_at_a_time_gives_the_same_exact_score(other_filters):
+    """A batch of one is no evaluation of one sequence, which has no standard error."""
+    vector, _ = other_filters
+    means = []
+    for batch_size in ("1", "4"):
+        assert main(["evaluate", vector, "--scores", "pll", "--batch-size", batch_size]) == 0
+        means.append(record(vector)["test/pll[bernoulli,K=128]"]["mean"])
+
+    assert means[0] == pytest.approx(means[1], rel=1e-5)
 
 
 def test_impossible_scores_and_numbers_are_one_sentence(other_filters, capsys):
@@ -465,8 +480,11 @@ def test_wrong_arguments_are_named(runs, tmp_path, capsys):
     assert "the test split" in refusal(capsys, runs[0], "--digits", "13")
     assert "--sequences" in refusal(capsys, runs[0], "--sequences", "most")
     short = refusal(capsys, runs[0], "--scores", "open-loop", "--context", "5")
-    assert "--context 5: sequence 2 of the test split" in short
-    assert "has 5 steps, expected more. Choose a smaller context" in short
+    assert "test split: sequence 2 has 5 steps, expected more than the context of 5. Choose a smaller" in short
+    assert f"{runs[0]}/: is named twice. Name each run once" in refusal(capsys, f"{runs[0]}/", runs[0])
+    assert "--episodes: is for agents, and none is named" in refusal(capsys, runs[0], "--episodes", "3")
+    agent = str(Path(__file__).parents[1] / "old_runs" / "agent")
+    assert "--split: is for world models" in error_of(capsys, "evaluate", agent, "--split", "train")
     assert "invalid choice: 'bleu'" in refusal(capsys, runs[0], "--scores", "bleu")
     assert "--device moon" in refusal(capsys, runs[0], "--device", "moon")
     assert "no such run folder" in refusal(capsys, str(tmp_path / "nowhere"))

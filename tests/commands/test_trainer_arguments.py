@@ -31,6 +31,7 @@ REFUSED = [
     ("gradient_clip_algorithm", "value", "is value, expected null. The model clips by norm: --model.clip_norm NORM"),
     ("default_root_dir", "there", "is there, expected null. Name the run folder: --run_dir DIR"),
     ("barebones", "true", "is True, expected false. Write less with --trainer.logger false"),
+    ("val_check_interval", "00:00:01:00", "is 00:00:01:00, expected a number of updates, or a fraction of an epoch."),
     ("model_registry", "mine", "is mine, expected null. It is for the checkpoints of Lightning's own callback"),
 ]
 REFUSED_BY_LIGHTNING = [

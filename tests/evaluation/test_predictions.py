@@ -53,6 +53,9 @@ def test_a_completion_has_a_frame_for_each_unseen_step(model, data, batch):
     assert completions.frames.max() <= 1
     assert torch.equal(completions.at(5), completions.frames[:, :, 0])
     assert torch.equal(completions.at(9), completions.frames[:, :, -1])
+    for time in (0, 4, 10):
+        with pytest.raises(ForbesError, match=f"step {time} was not completed, expected 5 to 9"):
+            completions.at(time)
 
 
 def test_a_completion_knows_the_prefix_and_nothing_else(model, data, batch):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -175,6 +176,29 @@ def test_each_class_gives_the_digit_with_the_most_open_start(tmp_path):
     chosen = ambiguous_digits(data, context=3, neighbours=4)
 
     assert chosen.tolist() == [3, 2]  # of class 1 the first of two that are equally open, and of class 2
+
+
+def test_a_digit_that_has_ended_is_not_completed(tmp_path):
+    """The first test digit, as open as the second, ends within three steps."""
+    path = tmp_path / "strokes.npz"
+    make_strokes(path, {"train": [(10, 1), (10, 2)] * 2, "test": [(10, 1), (10, 1)]})
+    with np.load(path) as arrays:
+        values = dict(arrays)
+    kept = np.array([0, 1, 3, 4, 5, 6, 7])  # without the third point of the first digit
+    for name in ("test_points", "test_pen_up"):
+        values[name] = values[name][kept]
+    values["test_offsets"] = np.array([0, 3, 7], np.int32)
+    np.savez(path, **values)
+    data = SequenceDataModule(Strokes(path=str(path), validation=0), batch_size=2, length=4)
+
+    assert ambiguous_digits(data, context=3, neighbours=2).tolist() == [1]
+
+
+def test_a_run_without_a_test_split_is_named(capsys, tmp_path):
+    agent = str(Path(__file__).parents[1] / "old_runs" / "agent")
+    for figure in ("elbo", "per-step"):
+        assert main(["figures", figure, "--runs", agent, "-o", str(tmp_path)]) == 2
+        assert f"{agent}: its data have no test split" in capsys.readouterr().err
 
 
 def test_other_digits_can_be_named(runs, tmp_path):

@@ -68,6 +68,9 @@ def test_one_pixel_draws_what_it_gives_probability_to():
         (Bernoulli(), torch.full((2, 1, 1, 1), 7, dtype=torch.uint8), "values from 7 to 7, expected 0 and 1"),
         (Bernoulli(), torch.full((2, 1, 1, 1), -1.0), "values from -1 to -1, expected 0 and 1"),
         (Bernoulli(), torch.full((2, 1, 1, 1), torch.nan), "values from nan to nan, expected 0 and 1"),
+        (OneHot(), torch.tensor([[1.0, 0.0], [0.0, 0.0]]), "observations are not one-hot"),
+        (OneHot(), torch.tensor([[1.0, 1.0]]), "observations are not one-hot"),
+        (OneHot(), torch.tensor([[0.5, 0.5]]), "observations are not one-hot"),
     ],
 )
 def test_observations_without_a_density_are_refused(likelihood, observation, message):
@@ -79,6 +82,14 @@ def test_observations_with_a_density_pass():
     OnePixel().check(each_pixel())
     Bernoulli().check(images(2))
     Normal().check(images(256))
+    OneHot().check(torch.eye(3))
+
+
+@pytest.mark.parametrize("std", [0.0, -1.0, torch.nan])
+def test_a_spread_that_is_none_is_refused(std):
+    for kind in (Normal, VectorNormal, SymlogNormal):
+        with pytest.raises(ForbesError, match=f"{kind.__name__}: std is {std}, expected more than 0"):
+            kind(std=std)
 
 
 @pytest.mark.parametrize("std", [0.1, 1.0])

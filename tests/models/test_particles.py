@@ -230,7 +230,7 @@ def test_hidden_and_stochastic_states_are_redrawn_together():
     torch.manual_seed(0)
 
     _, before, after, *_ = run_particles(
-        model, encoded, 3, systematic, lambda features, target: next(given), dtype=torch.float64
+        model, encoded, 3, systematic, lambda features, target: (next(given), {}), dtype=torch.float64
     )
 
     parents = torch.cat((before.filtered.state, action[:, 2].repeat(3, 1)), -1)  # (3 B, D + A)

@@ -148,7 +148,7 @@ def test_a_model_of_one_part_is_the_model_of_that_array(model):
     assert torch.equal(found, expected)
 
 
-@pytest.mark.parametrize("model", [StateSpaceModel, VectorModel], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("model", [StateSpaceModel, VectorModel, ParticleModel], ids=lambda kind: kind.__name__)
 def test_the_parts_of_a_bound_sum_to_its_reconstruction(model):
     module = world(model, state_dim=0 if model is VectorModel else 4)
     mask = torch.ones(5, 6, dtype=torch.bool)
@@ -159,7 +159,8 @@ def test_the_parts_of_a_bound_sum_to_its_reconstruction(model):
     torch.testing.assert_close(sum(terms.parts.values()), terms.reconstruction)
     names = ["reconstruction/camera", "reconstruction/mask"]
     assert [name for name in measured if "/" in name] == [*names, "reconstruction/proprio"]
-    named = f"[camera=normal(0.5),mask=bernoulli,proprio=symlog-normal(0.1){'' if model is VectorModel else ',S=1'}]"
+    number = {StateSpaceModel: ",S=1", VectorModel: "", ParticleModel: ",K=8"}[model]
+    named = f"[camera=normal(0.5),mask=bernoulli,proprio=symlog-normal(0.1){number}]"
     assert module.model.bound_name.endswith(named)
 
 

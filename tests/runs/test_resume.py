@@ -183,6 +183,23 @@ def test_a_signal_does_not_part_the_batches_of_an_update(tiny_config, tmp_path, 
     assert_same_run(run, straight)
 
 
+def test_a_signal_does_not_lose_a_validation_within_an_epoch(tiny_config, tmp_path, monkeypatch):
+    fit = ["fit", "--config", str(tiny_config), "--trainer.val_check_interval", "2", "--data.batch_size", "2"]
+    straight, run = str(tmp_path / "straight"), str(tmp_path / "run")
+    assert main([*fit, "--run_dir", straight]) == 0
+
+    def interrupt(self, loss):
+        if self.global_step == 2:  # a validation follows update 4
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(WorldModel, "on_before_backward", interrupt)
+        assert main([*fit, "--run_dir", run]) == 128 + signal.SIGTERM
+    assert main(["fit", "--resume", run]) == 0
+
+    assert_same_run(run, straight)
+
+
 def test_signals_of_a_cluster_around_one_sigterm_lose_no_update(tiny_config, tmp_path, monkeypatch):
     """As SLURM sends them at a preemption, and a launcher passes them on."""
 

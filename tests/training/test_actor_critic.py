@@ -253,9 +253,10 @@ def test_two_hot_rewards_and_values_learn_from_the_codes():
 
 
 @pytest.mark.parametrize("rate", [-0.1, 1.1])
-def test_refuses_a_slow_critic_that_is_no_average(rate):
-    with pytest.raises(ForbesError, match=f"slow_critic is {rate}, expected 0 to 1"):
-        agent(slow_critic=rate)
+def test_refuses_shares_that_are_none(rate):
+    for name in ("slow_critic", "discount", "lambda_"):
+        with pytest.raises(ForbesError, match=f"{name} is {rate}, expected 0 to 1"):
+            agent(**{name: rate})
 
 
 @pytest.mark.parametrize("side", [-1, 1])

@@ -6,7 +6,7 @@ import pytest
 import torch
 from lightning import Trainer
 
-from forbes.beliefs import FlowBelief, GaussianBelief
+from forbes.beliefs import CategoricalBelief, FlowBelief, GaussianBelief
 from forbes.commands.cli import main
 from forbes.data import SequenceDataModule, Simulated
 from forbes.errors import ForbesError
@@ -87,6 +87,11 @@ def test_the_noise_of_an_update_depends_on_seed_and_update_only():
         losses.append(module.loss(batch).item())
 
     assert losses[0] == losses[1] != losses[2]
+
+
+def test_a_probability_is_no_belief_of_a_real_state():
+    with pytest.raises(ForbesError, match="a CategoricalBelief has no density"):
+        KnownBelief(LinearGaussian(), CategoricalBelief.configured(classes=1))
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,10 @@ def terms_of_first_update(model):
     [
         ({}, elbo_loss),
         ({"free_nats": 9.0}, lambda terms: elbo_loss(terms, 9.0)),
-        ({"free_nats": 0.5, "free_nats_per": "element"}, lambda terms: elbo_loss(terms, 0.5, "element")),
+        (
+            {"belief": GaussianBelief, "free_nats": 0.5, "free_nats_per": "element"},
+            lambda terms: elbo_loss(terms, 0.5, "element"),
+        ),
         ({"belief": GaussianBelief}, elbo_loss),
         ({"belief": GaussianBelief, "kl": "monte_carlo"}, lambda terms: elbo_loss(terms._replace(analytic_kl=None))),
         ({"kl_warmup": 10}, lambda terms: elbo_loss(terms, kl_weight=0.1)),
@@ -335,6 +338,36 @@ def test_an_update_changes_every_parameter_sooner_or_later():
 def test_a_path_derivative_that_does_not_exist_is_refused(flags, message):
     with pytest.raises(ForbesError, match=message):
         make_world_model(kl="path", **flags)
+
+
+ONE_HOT = partial(CategoricalBelief, classes=2)
+BALANCED = partial(CategoricalBelief, classes=2, kl_balance=0.8)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"free_nats_per": "element"}, "free_nats_per is element, but the KL is estimated by samples"),
+        ({"free_nats_per": "element", "belief": GaussianBelief, "model": ParticleModel}, "estimated by samples"),
+        ({"free_nats_per": "element", "belief": GaussianBelief, "kl": "path"}, "estimated by samples"),
+        ({"belief": BALANCED, "kl": "monte_carlo"}, "kl_balance weighs the gradients of the KL in closed form"),
+        ({"belief": BALANCED, "model": ParticleModel}, "kl_balance weighs the gradients of the KL in closed form"),
+        ({"belief": GaussianBelief, "prior": ONE_HOT}, "are real vectors, those of the prior one-hot variables"),
+        ({"belief": ONE_HOT, "prior": GaussianBelief}, "one-hot variables of 2 classes, those of the prior real"),
+        ({"belief": ONE_HOT, "prior": partial(CategoricalBelief, classes=4)}, "of the prior one-hot variables of 4"),
+        ({"kl": "exact"}, "kl is 'exact', expected analytic or monte_carlo or path"),
+        ({"free_nats_per": "digit"}, "free_nats_per is 'digit', expected batch or element"),
+        ({"schedule": "linear"}, "schedule is 'linear', expected constant or cosine"),
+        ({"activation": "gelu"}, "activation is 'gelu', expected relu"),
+        ({"warmup": -3}, "warmup is -3, expected at least 0"),
+        ({"kl_warmup": -5}, "kl_warmup is -5, expected at least 0"),
+        ({"free_nats": -1.0}, "free_nats is -1.0, expected at least 0"),
+        ({"model": ParticleModel.configured(resampling="never")}, "resampling is 'never', expected systematic or soft"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(flags, message):
+    with pytest.raises(ForbesError, match=message):
+        make_world_model(**{"state_dim": 4} | flags)
 
 
 def test_particles_train_by_the_path_derivative():

@@ -18,7 +18,8 @@ Train configurations with several seeds, evaluate all runs on the same sequences
 
 Each run has a folder DIR/NAME-SEED. Arguments after -- are passed to every `forbes fit`. Runs that have no scores yet
 are then evaluated as by `forbes evaluate`. Writes comparison.csv, .json and .md, and figures: scores, per-step,
-differences (to the first configuration). If interrupted, the same command resumes where it stopped.
+differences (to the first configuration). Agents are compared by their returns, in the tables of `forbes evaluate`. If
+interrupted, the same command resumes where it stopped.
 
   forbes compare strokes/{rssm,forbes,mixture} --seeds 5 --jobs 2     # two trainings at a time, a progress line each
   forbes compare strokes/rssm strokes/forbes --launcher ray --gpus-per-job 0.25

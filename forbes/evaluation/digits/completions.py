@@ -47,8 +47,9 @@ __all__ = [
     "score_completions",
     "select_prefixes",
     "summarise",
+    "summarise_classes",
+    "truth_scorer",
 ]
-__all__ += ["summarise", "summarise_classes", "truth_scorer"]
 
 _SHARES = (60, 80)
 """Percentages of the remaining steps after which a completion's class is compared with its final class."""

@@ -22,7 +22,7 @@ def mean_frame(frames: Tensor) -> Tensor:
 
 
 class TrainingPrefixes:
-    """TrainingPrefixes of the training digits that continue after some step.
+    """Beginnings of the training digits that continue after some step.
 
     They are compared after a blur of five pixels, so that strokes one pixel apart are near.
 
