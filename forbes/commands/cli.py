@@ -83,7 +83,8 @@ options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status.
 
-    The status is 0, 2 for an error that the user can fix, 3 for a training that diverged, 130 or 143 for a signal.
+    The status is 0, 1 for a report of problems (`doctor`, `data check`), 2 for an error that the user can fix, 3 for a
+    training that diverged, and 128 plus its number for a signal.
 
     Args:
         arguments: command line without the program's name. Default: that of the process.

@@ -68,12 +68,18 @@ def main(arguments: Sequence[str]) -> int:
 def _software() -> Iterator[Finding]:
     yield Finding("forbes", f"{forbes.__version__}, Python {platform.python_version()}")
     for name in REQUIRED:
-        yield Finding(name, version(name))
+        found = _version(name)
+        yield Finding(name, found or "not installed", "" if found else f"pip install {name}", fatal=found is None)
     for name, extra in OPTIONAL.items():
-        try:
-            yield Finding(name, version(name))
-        except PackageNotFoundError:
-            yield Finding(name, "not installed (optional)", f"pip install 'forbes\\[{extra}]'")
+        found = _version(name)
+        yield Finding(name, found or "not installed (optional)", "" if found else f"pip install 'forbes\\[{extra}]'")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
 
 def _hardware() -> Iterator[Finding]:

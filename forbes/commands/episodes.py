@@ -10,7 +10,7 @@ from forbes.data.episodes.episode import EpisodeRecord
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.factors import as_discrete, factor_sizes
 from forbes.figures.episodes import draw_strips
-from forbes.figures.grids import is_image
+from forbes.figures.grids import is_image, require_images
 from forbes.figures.style import save_figure
 from forbes.shapes import shape_of
 
@@ -24,13 +24,19 @@ def info(path: Path, output: Path | None = None) -> None:
         path: folder of the store.
         output: image file to write. Default: `frames.png` in the folder. Only images with at most four channels are
             drawn.
+
+    Raises:
+        ForbesError: if the store is empty, or a picture is asked for and there are no images.
     """
     store = EpisodeStore(path)
     store.require_episodes()
+    shape = shape_of(store.records[min(store.records)].environment["observation_shape"])
+    if output is not None:
+        require_images(f"-o {output}", shape, "Leave -o out")
     records = sorted(store.records.values(), key=lambda record: record.total_reward)
     for name, value in _facts(store, records):
         print(f"{name:<22}{value}")
-    if is_image(shape_of(records[0].environment["observation_shape"])):
+    if is_image(shape):
         chosen = {record.number: record for record in (records[0], records[len(records) // 2], records[-1])}
         rows = [(f"episode {n}\nreturn {one.total_reward:.1f}", store.episode(n)) for n, one in chosen.items()]
         picture = output or path / "frames.png"

@@ -29,6 +29,8 @@ class FitOptions(NamedTuple):
         """Return the options, and the arguments of the configuration, after those of a resumed run."""
         options, rest = run_options().parse_known_args(arguments)
         for option in ("resume", "run_dir"):
+            if getattr(options, option) == "":
+                raise ForbesError(f"--{option}: is empty, expected a run folder. Name one, or leave it out")
             if (folder := getattr(options, option)) and folder.endswith(".ckpt"):
                 raise ForbesError(f"--{option} {folder}: is a checkpoint, expected a run folder")
             if folder and is_pretrained(folder):

@@ -17,7 +17,7 @@ def next_steps(run: RunFolder, module: LightningModule) -> str:
     name = shlex.quote(str(run))
     commands = [f"forbes runs show {name}"]
     if isinstance(module, WorldModelAgent):
-        commands += [f"forbes evaluate {name}", f"forbes rollout {name} --video agent.gif"]
+        commands += [f"forbes evaluate {name}", f"forbes rollout {name} --video agent.gif --imagine 15"]
     elif isinstance(module, WorldModel):
         commands += [f"forbes evaluate {name}", f"forbes figures elbo --runs {name}"]
     elif isinstance(module, KnownBelief):

@@ -156,7 +156,8 @@ def _problem_of(failure: Any) -> str:
     for batch in failure["batches"]:
         if not isinstance(batch, dict) or {*batch} != {*SequenceBatch._fields}:
             return "one of its batches lacks a field"
-        if not all(isinstance(value, Tensor) for value in batch.values()):
+        parts = batch["observation"] if isinstance(batch["observation"], dict) else {}
+        if not all(isinstance(value, Tensor) for value in (batch | parts).values() if value is not parts):
             return "one of its batches has values that are not tensors"
     processes = failure.get("processes", 1)  # files of older versions have none
     if type(processes) is not int or processes < 1 or any(len(b["mask"]) % processes for b in failure["batches"]):

@@ -35,7 +35,8 @@ def main(argv: Sequence[str]) -> None:
     args = parser().parse_args(argv)
     folder = args.output or Path("runs/reproduce") / args.budget
     gpu = torch.cuda.is_available()
-    at_once = args.jobs or (1 if gpu else min(os.cpu_count() or 1, 4))
+    jobs_here = args.jobs if args.launcher == "local" else None  # --jobs of a cluster are not of this machine
+    at_once = jobs_here or (1 if gpu else min(os.cpu_count() or 1, 4))
     launcher = open_launcher(args, folder, at_once)
     planned = [one for part in args.only for one in trainings(part, args.budget, folder)]
     _require_budget(folder, args.budget)

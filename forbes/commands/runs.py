@@ -145,7 +145,8 @@ def _show(path: str) -> None:
         metrics = read_metrics(path)
         for name in _curves(list(metrics)):
             of_one = metrics[name].dropna()
-            print(f"\n{name}, by update; last {_value(float(of_one.iloc[-1]))}")
+            last = f"; last {_value(float(of_one.iloc[-1]))}" if len(of_one) else ""
+            print(f"\n{name}, by update{last}")
             print(*curve(of_one.index.tolist(), of_one.tolist(), _WIDTH), sep="\n")
     if scores := _recorded(RunFolder(path).results / "evaluation.json"):
         print("\nrecorded scores, mean ± standard error")

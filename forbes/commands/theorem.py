@@ -39,6 +39,8 @@ _SCAN = """\
 Between the exact filter and the best q(s_t|o_1:t), the ELBO and the prequential score rank the beliefs in opposite \
 orders."""
 
+_EXACT = "With F = 0, or one step, all four beliefs are the exact one, so the tables have no differences."
+
 
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
@@ -49,6 +51,9 @@ def main(argv: Sequence[str]) -> None:
     processes = _processes(args)
     screen = console(80)
     table, apart = _identity(processes, args.samples, args.seed)
+    if all(process.transition == 0 or process.steps == 1 for process in processes):
+        screen.print(table, _beliefs(processes), _scan(processes), _EXACT, sep="\n", highlight=False)
+        return
     screen.print(table, _IDENTITY.format(apart=apart), "", sep="\n", highlight=False)
     screen.print(_beliefs(processes), _BELIEFS, "", sep="\n", highlight=False)
     screen.print(_scan(processes), _SCAN, sep="\n", highlight=False)

@@ -54,15 +54,16 @@ class DeepMindControl(Environment):
         pixels: observe images, uint8 `(3, size, size)`; otherwise the task's measurements, float32 `(O,)`, in the
             suite's order.
         action_repeat: number of frames per action, R.
-        camera: index of the camera.
-        size: side of the images in pixels.
+        camera: index of the camera. This, `size` and `fast` are for images.
+        size: side of the images in pixels; 64 by default.
         fast: render without shadows, which on a CPU take most of the time. This changes the pixels, so it is not for
             published results. Multisampling stays on: without it a thin pole vanishes in a small image.
         proprio: with `pixels`, observe the measurements too: the parts `camera` and `proprio`.
         backend: OpenGL backend that is known to render. Default: the one of `choose_backend`.
 
     Raises:
-        ForbesError: for an unknown task or camera, unbounded actions, or if no backend renders.
+        ForbesError: for an unknown task or camera, unbounded actions, options of images without `pixels`, or if no
+            backend renders.
 
     Example:
         >>> environment = forbes.DeepMindControl("cartpole_swingup", pixels=False)
@@ -78,7 +79,7 @@ class DeepMindControl(Environment):
         pixels: bool = True,
         action_repeat: int = 2,
         camera: int | None = None,
-        size: int = 64,
+        size: int | None = None,
         fast: bool = False,
         proprio: bool = False,
         backend: str | None = None,
@@ -86,6 +87,10 @@ class DeepMindControl(Environment):
         require_repeat(task, action_repeat)
         if proprio and not pixels:
             raise ForbesError(f"{task}: proprio adds the measurements to images, expected pixels. Leave proprio out")
+        for name, value in (("camera", camera), ("size", size), ("fast", fast or None)):
+            if value is not None and not pixels:
+                raise ForbesError(f"{task}: {name} is for images, expected pixels. Leave {name} out")
+        size = size or 64
         self.task, self.pixels, self.action_repeat, self.size, self.fast = task, pixels, action_repeat, size, fast
         self.proprio = proprio
         self.backend = (backend or choose_backend().backend) if pixels else _NO_RENDERING

@@ -83,7 +83,7 @@ def find_environment(task: str, **options: Any) -> Callable[[], Environment]:
     elif task.startswith(_GYMNASIUM):
         _require_known_module(task)
         make = partial(Gymnasium, task.removeprefix(_GYMNASIUM))
-    elif near := difflib.get_close_matches(task, [*external, *_NAMED], n=1, cutoff=0.8):
+    elif near := difflib.get_close_matches(task, [*(external if "_" not in task else ()), *_NAMED], n=1, cutoff=0.8):
         raise ForbesError(f"{task}: no such task. Did you mean {near[0]}?")
     elif "_" not in task:  # every DOMAIN_TASK of DeepMind Control has one
         raise ForbesError(

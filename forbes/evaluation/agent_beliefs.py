@@ -41,6 +41,8 @@ __all__ += ["uncertainty"]
 
 DRAWS = 256
 """Number of samples of each belief for the reward uncertainty."""
+_ROUNDING = 1e-20
+"""Sums of variances below this are errors of rounding, in squared units of reward."""
 _DRAWS = 1024
 _STEPS = 64
 """Maximal number of steps per episode for the distance from a Gaussian, evenly spaced."""
@@ -146,7 +148,8 @@ def learned_variance(agent: WorldModelAgent, episode: Episode, seed: int) -> Ten
         return reward.double().var(0).cpu()
 
 
-def uncertainty(learned: Sequence[Tensor], exact: Sequence[Tensor]) -> Estimate:
-    """Return u over E episodes, at least 2, with the standard error of a ratio."""
-    sums = (torch.stack([variance.sum() for variance in variances]) for variances in (learned, exact))  # 2 x (E,)
-    return Estimate.per_step(*sums)
+def uncertainty(learned: Sequence[Tensor], exact: Sequence[Tensor]) -> Estimate | None:
+    """Return u over E episodes, at least 2, with the standard error of a ratio; None if no reward is uncertain."""
+    of_agent, of_exact = (torch.stack([variance.sum() for variance in variances]) for variances in (learned, exact))
+    certain = of_exact.sum() < _ROUNDING
+    return None if certain else Estimate.per_step(of_agent, of_exact)  # 2 x (E,)

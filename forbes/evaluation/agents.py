@@ -124,8 +124,8 @@ def _play(
     belief: dict[str, Estimate] = {}
     if distances:
         belief |= zip(DISTANCES, map(Estimate.of, torch.stack(distances, 1)), strict=True)  # 2 x (E,)
-    if variances:
-        belief[REWARD] = uncertainty(*zip(*variances, strict=True))
+    if variances and (ratio := uncertainty(*zip(*variances, strict=True))):
+        belief[REWARD] = ratio
     return PlayedAgent(run, agent, returns, r2, belief, describe_environment(environment), checkpoint)
 
 

@@ -52,6 +52,8 @@ class _Nodes(NamedTuple):
     """States, `(N, B, T, D)`."""
     log_ratio: Tensor
     """log p - log q, `(N, B, T)`."""
+    log_conditional: Tensor
+    """The same where q is conditioned on the points, as its weights are."""
     weight: Tensor
     """Weights for p and for q, `(2, N, B, T)`."""
 
@@ -67,7 +69,8 @@ def belief_errors(
     """Compare a belief with the exact one.
 
     If the exact belief is a grid, expectations are sums over its cells: without noise, and exact as long as the other
-    belief is no narrower than a cell. The other belief is then conditioned on the grid. Otherwise both are sampled.
+    belief is no narrower than a cell. Expectations under the other belief are then those given the grid. Otherwise both
+    are sampled.
 
     Args:
         exact: exact beliefs p, batch shape `(B, T)`, float64.
@@ -84,7 +87,7 @@ def belief_errors(
     of_exact, of_belief = nodes.weight  # 2 x (N, B, T)
     errors = {
         "forward_kl": _expectation(of_exact, nodes.log_ratio),
-        "reverse_kl": _expectation(of_belief, -nodes.log_ratio),
+        "reverse_kl": _expectation(of_belief, -nodes.log_conditional),
         "state_nll_regret": exact.log_prob(state) - belief.log_prob(state),
         "variance_ratio": _variance(nodes.point, of_belief) / _variance(nodes.point, of_exact),
     }
@@ -121,7 +124,8 @@ def _cells(exact: GridBelief, belief: Belief) -> _Nodes:
     """Return the cells of a grid as nodes (midpoint rule)."""
     point = exact.centres.expand(exact.log_mass.shape).movedim(-1, 0).unsqueeze(-1)  # (G, B, T, 1)
     log_exact, log_belief = exact.log_prob(point), belief.log_prob(point)  # 2 x (G, B, T)
-    return _Nodes(point, log_exact - log_belief, torch.stack((log_exact, log_belief)).softmax(1))
+    log_mass = torch.stack((log_exact, log_belief)).log_softmax(1)  # (2, G, B, T)
+    return _Nodes(point, log_exact - log_belief, log_mass[0] - log_mass[1], log_mass.exp())
 
 
 def _draws(exact: ExactBelief, belief: Belief, samples: int, generator: torch.Generator) -> _Nodes:
@@ -134,7 +138,8 @@ def _draws(exact: ExactBelief, belief: Belief, samples: int, generator: torch.Ge
     """
     point = torch.cat((exact.sample(samples, generator), belief.sample(samples, generator)))  # (2 n, B, T, D)
     log_density = torch.stack((exact.log_prob(point), belief.log_prob(point)))  # (2, 2 n, B, T)
-    return _Nodes(point, log_density[0] - log_density[1], log_density.softmax(0) / samples)
+    log_ratio = log_density[0] - log_density[1]  # (2 n, B, T)
+    return _Nodes(point, log_ratio, log_ratio, log_density.softmax(0) / samples)
 
 
 def _expectation(weight: Tensor, values: Tensor) -> Tensor:

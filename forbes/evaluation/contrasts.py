@@ -57,15 +57,14 @@ def _paired(claim: Claim, runs: Mapping[str, str]) -> Estimate | None:
 
     Families of one task have the same sequences, and are paired. Tasks are independent, and are summed.
     """
+    scores = {family: values for family, run in runs.items() if (values := _scores(run, claim.score)) is not None}
+    if len(scores) < len(runs):
+        return None
     _require_same_data(claim, runs)
-    scores = {family: _scores(run, claim.score) for family, run in runs.items()}
     tasks: dict[str, NDArray[np.float64]] = {}
     for family in claim.families:
-        values = scores[family]
-        if values is None:
-            return None
         task, sign = task_of(family), 1 if family in claim.plus else -1
-        tasks[task] = tasks.get(task, 0.0) + claim.sign * sign * values
+        tasks[task] = tasks.get(task, 0.0) + claim.sign * sign * scores[family]
     if (order := _order(claim, runs)) is None:
         return None
     estimates = [Estimate.of(torch.from_numpy(values)) for values in tasks.values()]

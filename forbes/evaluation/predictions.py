@@ -11,7 +11,7 @@ from forbes.models import BeliefModel, EncodedSequence, Rollout, State, StateSpa
 from forbes.shapes import printed_by_shape
 
 __all__ = ["Completions", "complete", "expected_frames", "filter", "first_of_each_class", "imagine", "open_loop_frames"]
-__all__ += ["whole_sequences"]
+__all__ += ["true_frames", "whole_sequences"]
 
 
 @printed_by_shape
@@ -33,6 +33,11 @@ class Completions(NamedTuple):
         if not self.context < time <= last:
             raise ForbesError(f"Completions: step {time} was not completed, expected {self.context + 1} to {last}")
         return self.frames[:, :, time - self.context - 1]
+
+
+def true_frames(model: BeliefModel, source: SequenceSource, batch: SequenceBatch) -> Tensor:
+    """Return the true images as grey values in [0, 1], as those of the model's means, `(B, T, C, H, W)`."""
+    return source.pictures(model.likelihood.images(model.likelihood.picture(batch.observation)))
 
 
 @torch.no_grad()

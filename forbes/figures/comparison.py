@@ -27,7 +27,7 @@ def draw_scores(comparison: Comparison) -> Figure:
     belief.
     """
     table = comparison.scores
-    known = table[[score_of(metric) == "log_p" for metric in table["metric"]]]["mean"].mean()
+    exact = table[[score_of(metric) == "log_p" for metric in table["metric"]]].groupby("metric")["mean"].mean().dropna()
     metrics = [metric for metric in table["metric"].unique() if score_of(metric) in SCORES]
     families = list(table["family"].unique())
     columns = min(3, len(metrics))
@@ -35,11 +35,13 @@ def draw_scores(comparison: Comparison) -> Figure:
     with paper_style():
         figure = Figure((PAGE, rows * (1.1 + 0.22 * len(families))), layout="constrained")
         panels = figure.subplots(rows, columns, sharey=True, squeeze=False).flat
-        dotted = False
+        dotted = dashed = False
         for axes, metric in zip(panels, metrics, strict=False):
             _draw_score(axes, table[table["metric"] == metric], families)
-            if score_of(metric) != "open_loop" and not np.isnan(known):
+            known = exact.get(f"{metric.partition('/')[0]}/log_p[exact]")  # of the same sequences
+            if score_of(metric) != "open_loop" and known is not None:
                 axes.axvline(known, color=GREY, ls="--", lw=0.8)
+                dashed = True
             axes.set_title(_in_lines(metric))
             axes.margins(x=0.15)
             dotted |= draw_references(axes, comparison.references.get(metric, {}), along="x")
@@ -49,10 +51,10 @@ def draw_scores(comparison: Comparison) -> Figure:
         panels[0].set_yticks(range(len(families)), [method_title(name) for name in families])
         rows_and_label = len(families) * (4 / 3 if dotted else 1)  # the lowest quarter is for the references' label
         panels[0].set_ylim(rows_and_label - 0.5, -0.5)
-        dashed = "" if np.isnan(known) else ", dashed: the exact log p, which no bound exceeds"
+        ceiling = ", dashed: the exact log p, which no bound exceeds" if dashed else ""
         names = list(next(iter(comparison.references.values()), {}))
         below = f", dotted: models without a belief, {names[0]} to {names[-1]}" if dotted else ""
-        figure.supxlabel(f"nats per sequence, higher is better{dashed}{below}", fontsize=8)
+        figure.supxlabel(f"nats per sequence, higher is better{ceiling}{below}", fontsize=8)
     return figure
 
 

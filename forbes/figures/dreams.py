@@ -69,11 +69,11 @@ def curves(seen: NDArray[np.float32], imagined: NDArray[np.float32], horizon: in
     with paper_style():
         figure = Figure((1.5 * height / _DPI, height / _DPI), dpi=_DPI, layout="constrained")
         axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-        broken = imagined.copy()
-        broken[horizon + 1 :: horizon + 1] = np.nan  # a gap where the imagination starts again
         for index, axis in enumerate(axes):
             axis.plot(time, seen[:, index], color=BLACK, lw=0.8)
-            axis.plot(time, broken[:, index], color=ORANGE, lw=0.8)
+            for first in range(0, len(seen), horizon + 1):  # a gap where the imagination starts again
+                part = slice(first, first + horizon + 1)
+                axis.plot(time[part], imagined[part, index], color=ORANGE, lw=0.8)
             axis.set_ylabel(str(index), rotation=0, labelpad=6, fontsize=6, va="center")
             axis.set_yticks([])
             axis.tick_params(labelsize=6)

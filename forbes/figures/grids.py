@@ -113,9 +113,8 @@ def require_only_images(where: str, shape: Shape, remedy: str) -> None:
 
 
 def _frames(observation: Tensor, times: Sequence[int]) -> Tensor:
-    """Return K steps, counted from 1, scaled to [0, 1]: `(B, T, C, H, W)` to `(B, K, C, H, W)`."""
-    grey = observation.float() / observation.max().clamp(min=1)
-    return grey[:, [time - 1 for time in times]]
+    """Return K steps, counted from 1: `(B, T, C, H, W)` to `(B, K, C, H, W)`."""
+    return observation.float()[:, [time - 1 for time in times]]
 
 
 def draw_panels(panels: Sequence[Panel | Bars], width: float = PAGE) -> Figure:

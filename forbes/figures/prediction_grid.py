@@ -3,7 +3,7 @@
 from matplotlib.figure import Figure
 
 from forbes.data import SequenceBatch, SequenceData
-from forbes.evaluation.predictions import complete
+from forbes.evaluation.predictions import complete, true_frames
 from forbes.evaluation.runs import model_name
 from forbes.figures.grids import Panel, draw_panels, seen_panel, truth_panel
 from forbes.figures.style import method_styles
@@ -28,7 +28,7 @@ def prediction_grid(model: BeliefModel, data: SequenceData, batch: SequenceBatch
     sampled = [
         Panel(f"sampled completions, t = {time}", completions.at(time).transpose(0, 1), colour) for time in times
     ]
-    pictures = data.source.pictures(batch.observation)
+    pictures = true_frames(model, data.source, batch)
     return draw_panels([truth_panel(pictures, times[::-1]), seen_panel(pictures, context), *sampled])
 
 

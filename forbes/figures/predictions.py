@@ -10,7 +10,7 @@ from forbes.data import SequenceBatch, SequenceData, SequenceSource, Strokes
 from forbes.errors import ForbesError
 from forbes.evaluation.adapters import load_all
 from forbes.evaluation.digits.neighbours import TrainingPrefixes, last_frame
-from forbes.evaluation.predictions import complete, first_of_each_class, whole_sequences
+from forbes.evaluation.predictions import complete, first_of_each_class, true_frames, whole_sequences
 from forbes.figures.families import RunFamily, group, require_same_data
 from forbes.figures.grids import Panel, draw_panels, require_only_images, seen_panel, truth_panel
 from forbes.seeding import forked
@@ -101,7 +101,7 @@ def predictions(
         seed: random seed for the samples.
     """
     last = batch.observation.shape[1]
-    pictures = source.pictures(batch.observation)
+    pictures = true_frames(families[0].model, source, batch)
     panels = [truth_panel(pictures, sorted({time, last})[::-1]), seen_panel(pictures, context)]
     for family in families:
         with forked("cpu", seed):

@@ -9,7 +9,7 @@ from torch import Tensor
 from forbes.data import Experience, Replay, SequenceBatch, SequenceData, SequenceSource, Split
 from forbes.errors import ForbesError
 from forbes.evaluation.methods import group_by_method, read_run
-from forbes.evaluation.predictions import complete
+from forbes.evaluation.predictions import complete, true_frames
 from forbes.evaluation.runs import TrainedRun, load_runs
 from forbes.figures.agents import variant_styles
 from forbes.figures.grids import Panel, draw_bands, require_images
@@ -94,8 +94,7 @@ def reconstructions(
         seed: random seed for the samples.
     """
     first = next(iter(models.values()))
-    likelihood = first.model.likelihood
-    truth = first.data.source.pictures(likelihood.images(likelihood.picture(batch.observation)))  # (B, T, C, H, W)
+    truth = true_frames(first.model, first.data.source, batch)  # (B, T, C, H, W)
     times = torch.linspace(1, truth.shape[1], min(_FRAMES, truth.shape[1])).round().long().tolist()
     rows: list[tuple[str, str, Tensor]] = [("truth", BLACK, truth)]
     for title, run in models.items():

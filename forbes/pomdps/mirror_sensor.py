@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from forbes.errors import require_positive
+from forbes.errors import require_at_least, require_positive
 from forbes.pomdps.base import ExactFilter, Process
 from forbes.pomdps.distributions import DiagonalGaussian
 from forbes.pomdps.grid import Grid, grid_filter
@@ -39,7 +39,8 @@ class MirrorSensor(Process):
     action_dim = 0
 
     def __init__(self, observation_std: float = 0.1, cells: int = 1601) -> None:
-        require_positive("MirrorSensor", observation_std=observation_std, cells=cells - 1)
+        require_positive("MirrorSensor", observation_std=observation_std)
+        require_at_least(2, "MirrorSensor", cells=cells)
         self.observation_std = observation_std
         self.grid = Grid.around_kink(-HALF_WIDTH, HALF_WIDTH, cells, kink=0.0)  # |s| has a kink at 0
 

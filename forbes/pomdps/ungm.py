@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from forbes.errors import require_positive
+from forbes.errors import require_at_least
 from forbes.pomdps.base import ExactFilter, Process
 from forbes.pomdps.distributions import DiagonalGaussian
 from forbes.pomdps.grid import Grid, grid_filter
@@ -40,7 +40,7 @@ class Ungm(Process):
     action_dim = 1
 
     def __init__(self, cells: int = 901) -> None:
-        require_positive("Ungm", cells=cells - 1)
+        require_at_least(2, "Ungm", cells=cells)
         self.grid = Grid(-45.0, 45.0, cells)
 
     def initial(self, like: Tensor) -> DiagonalGaussian:

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+from collections.abc import Mapping
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from small_agents import forbes, write_config
 from torch.optim import Adam
 
 from forbes.commands.cli import main
+from forbes.commands.replay import _FIELDS, _problem_of
 from forbes.control.return_scale import ReturnScale
 from forbes.data import SequenceBatch
 from forbes.runs.checkpoint import read_checkpoint
@@ -207,6 +209,7 @@ def test_replay_of_no_file_is_one_sentence(tiny_run, capsys):
         ({"update": None}, "its update is NoneType, expected the failure.pt of a run that diverged"),
         ({"batches": [{}]}, "one of its batches lacks a field"),
         ({"batches": []}, "it does not have one number per batch"),
+        ({"batches": [dict.fromkeys(SequenceBatch._fields, 1)]}, "one of its batches has values that are not tensors"),
         ({"processes": 3}, "its batches cannot be shared by 3 processes"),
         ({"state_dict": {}}, "it has no model."),
     ],
@@ -220,6 +223,17 @@ def test_replay_refuses_what_is_no_failure_in_one_sentence(diverged, capsys, cha
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert sentence in error
+
+
+def test_a_batch_of_several_parts_is_one_to_replay():
+    batch = dict.fromkeys(SequenceBatch._fields, torch.zeros(2, 3))
+    batch["observation"] = {"camera": torch.zeros(2, 3, 1, 4, 4), "proprio": torch.zeros(2, 3, 2)}
+    failure = {name: {} if kind is Mapping else kind() for name, kind in _FIELDS.items()}
+    failure |= {"batches": [batch], "batch_numbers": [0]}
+
+    assert _problem_of(failure) == ""
+    batch["observation"] = batch["observation"] | {"proprio": None}
+    assert _problem_of(failure) == "one of its batches has values that are not tensors"
 
 
 LOWER_RATE = ["--on-divergence", "lower-rate"]

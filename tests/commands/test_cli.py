@@ -203,6 +203,8 @@ def test_misspelt_arguments_of_a_class_are_named(tiny_config, tmp_path, capsys):
         (["--resume", "absent"], "absent: no such run folder"),
         (["--run_dir", "/proc/run"], "/proc/run: no such file or directory"),
         (["--resume", "pretrained:strokes-forbes", "--run_dir", "b"], "not allowed with argument"),
+        (["--resume", ""], "--resume: is empty, expected a run folder. Name one, or leave it out"),
+        (["--run_dir", ""], "--run_dir: is empty, expected a run folder. Name one, or leave it out"),
         (["--allow-module", "no_such_module"], "--allow-module no_such_module: No module named 'no_such_module'"),
         (["--allow-module"], "--allow-module: the name is missing"),
     ],

@@ -158,6 +158,17 @@ def test_an_outlier_is_labelled_and_the_exact_line_is_drawn():
     assert panel.lines[-1].get_xdata()[0] == -0.5
 
 
+def test_the_exact_line_is_that_of_the_same_sequences():
+    """The exact score is of the whole split, the others may be of its first thousand sequences."""
+    rows = [("a", "test[:1000]/pll[K=1]", -8.5), ("a", "test/log_p[exact]", -9.0)]
+    table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])
+
+    figure = draw_scores(Comparison(table, table, {}, {}))
+
+    assert all(line.get_linestyle() != "--" for line in figure.axes[0].lines)
+    assert "dashed" not in figure.get_supxlabel()
+
+
 def test_a_difference_that_two_families_do_not_have_says_so():
     rows = [("a", "test/elbo[S=1]", 1.0), ("a", "test/pll[K=1]", 2.0), ("b", "test/pll[K=1]", -1.0)]
     table = pd.DataFrame([{"family": f, "metric": m, "seed": 0, "mean": v, "standard_error": 0.1} for f, m, v in rows])

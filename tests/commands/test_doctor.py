@@ -1,5 +1,6 @@
 """The doctor finds what is missing, and says what to do."""
 
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -26,6 +27,15 @@ def test_a_machine_that_can_train_is_well(capsys):
     output = capsys.readouterr().out
     for word in ("torch", "CPUs", "free disk", "configurations", "strokes, bundled"):
         assert word in output
+
+
+def test_a_missing_package_is_named_with_its_remedy(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr("forbes.commands.doctor.REQUIRED", ("torch", "no-such-package"))
+
+    assert main(["doctor"]) == 1
+
+    assert re.search(r"no-such-package +not installed +pip install no-such-package", capsys.readouterr().out)
 
 
 def test_missing_data_are_named_with_their_remedy(capsys, monkeypatch, tmp_path):

@@ -167,6 +167,8 @@ def test_vectors_are_described_and_not_drawn(tmp_path, capsys):
     assert re.search(r"task +MountainHike", output)
     assert re.search(r"steps +75 agent steps, 75 env steps", output)
     assert not list(store.glob("*.png"))
+    assert main(["data", "info", str(store), "-o", str(tmp_path / "frames.png")]) == 2
+    assert "frames.png: the observations are vectors of 2, expected images" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -174,6 +174,18 @@ def test_curves_have_a_line_at_the_present_step():
     assert moved == sorted(set(moved))
 
 
+def test_every_imagined_step_is_drawn():
+    """With one step of imagination, each second point was a gap, and nothing was drawn."""
+    seen = np.zeros((40, 1), np.float32)
+
+    orange = []
+    for horizon in (1, 15):
+        frame = curves(seen, seen + 1, horizon, height=256)[0].astype(int)
+        orange.append(int(((frame[0] > 180) & (frame[2] < 120)).sum()))
+
+    assert orange[0] > 0.3 * orange[1] > 0
+
+
 def test_an_agent_of_vectors_is_drawn_as_curves(tmp_path):
     vectors = tmp_path / "vectors"
     assert fit("--config", write_config(tmp_path), "--run_dir", vectors, "--trainer.max_epochs", 1) == 0

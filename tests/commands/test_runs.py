@@ -235,3 +235,12 @@ def test_the_first_values_do_not_flatten_a_curve():
 
     assert lines[3].strip().startswith("≤ -9.")
     assert heights(lines)[-1] == 0
+
+
+def test_a_curve_without_a_number_is_none(tmp_path, capsys):
+    lines = [{"update": 10, "epoch": 0, ELBO: float("nan"), "val/kl": 3.0}]
+    assert main(["runs", "show", str(write(tmp_path / "runs/a", 0, lines=lines))]) == 0
+
+    output = capsys.readouterr().out
+    assert f"{ELBO}, by update\n" in output
+    assert "val/kl, by update; last 3.00" in output

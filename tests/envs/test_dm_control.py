@@ -7,7 +7,7 @@ import pytest
 from dm_control import _render, suite
 from toy_environments import EvaluatedRun
 
-from forbes.envs import DeepMindControl, EnvironmentProcess, find_environment
+from forbes.envs import DeepMindControl, Environment, EnvironmentProcess, find_environment
 from forbes.errors import ForbesError
 
 
@@ -196,3 +196,16 @@ def test_image_and_proprioception_are_those_of_each_alone(backend):
 def test_proprioception_needs_pixels():
     with pytest.raises(ForbesError, match="proprio adds the measurements to images, expected pixels"):
         DeepMindControl("cartpole_swingup", pixels=False, proprio=True)
+
+
+@pytest.mark.parametrize("option", [{"camera": 1}, {"size": 64}, {"fast": True}], ids=str)
+def test_options_of_images_need_pixels(option):
+    with pytest.raises(ForbesError, match=f"{next(iter(option))} is for images, expected pixels"):
+        DeepMindControl("cartpole_swingup", pixels=False, **option)
+
+
+def test_a_class_of_a_similar_name_does_not_hide_a_task():
+    class CartpoleSwingup(Environment):
+        """Of a user, in a module that was imported."""
+
+    assert find_environment("cartpole_swingup", pixels=False)().task == "cartpole_swingup"

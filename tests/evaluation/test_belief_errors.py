@@ -145,3 +145,14 @@ def test_the_gaussian_of_the_same_moments_has_them():
     matched = moment_matched(exact)
     torch.testing.assert_close(matched.mean, exact.mean)
     torch.testing.assert_close(matched.variance, exact.variance)
+
+
+def test_mass_outside_of_the_grid_is_no_negative_divergence():
+    """q = (p + a Gaussian far outside) / 2. Given the grid it is p, so that KL(q ‖ p) is 0, where it was -log 2."""
+    exact = mixture([1.0], [[0.0]], [[1.0]], copies=1)
+    other = mixture([0.5, 0.5], [[0.0], [40.0]], [[1.0]], copies=1)
+
+    found = errors_of(on_grid(exact), other, exact.mean)
+
+    torch.testing.assert_close(found["reverse_kl"], torch.zeros(1, 1, dtype=torch.float64), rtol=0, atol=1e-9)
+    torch.testing.assert_close(found["forward_kl"], torch.full((1, 1), math.log(2), dtype=torch.float64))

@@ -166,6 +166,8 @@ def test_seeds_that_lack_a_family_are_left_out(recorded):
 
     assert list(contrast(claim_of(("t/a",), ("t/b",), "elbo"), runs, {})) == [1]
     assert contrast(claim_of(("t/a",), ("t/b",), "pll"), runs, {}) == {}
+    runs["t/b", 0] = recorded("not-measured", pll=[1, 2])
+    assert list(contrast(claim_of(("t/a",), ("t/b",), "elbo"), runs, {})) == [1]
 
 
 def test_other_sequences_are_not_compared(recorded):

@@ -12,7 +12,7 @@ from forbes.envs.known_process import KnownProcess
 from forbes.evaluation.agent_beliefs import DRAWS, exact_variance, learned_variance, uncertainty
 from forbes.evaluation.record import read_record
 from forbes.models import Filtered
-from forbes.pomdps import MountainHike, Tiger
+from forbes.pomdps import MountainHike, Tiger, TMaze
 
 
 class Coordinates(MountainHike):
@@ -132,3 +132,11 @@ def test_evaluate_says_it_of_a_known_process_and_of_nothing_else(tmp_path, capsy
 
     assert forbes("evaluate", tmp_path / "parrot", "--episodes", 2) == 0
     assert key not in read_record(str(tmp_path / "parrot"))
+
+
+def test_where_every_reward_is_certain_there_is_no_ratio():
+    """In the T-maze the exact belief is a point: the sum of its variances is rounding, and the ratio was 1e30."""
+    episode = episode_of(TMaze())
+    exact = exact_variance(TMaze(), episode, 0)
+
+    assert uncertainty([torch.full_like(exact, 1e-3)] * 2, [exact] * 2) is None

@@ -2,12 +2,17 @@
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from command_line import error_of
 
 from forbes.commands.cli import main
 from forbes.data.episodes.episode import Episode
 from forbes.data.episodes.store import EpisodeWriter
+from forbes.evaluation.runs import load_runs
+from forbes.figures.families import group
+from forbes.figures.prediction_grid import prediction_grid
+from forbes.figures.predictions import predictions
 
 ENVIRONMENT = {"task": "Fading", "observation_shape": [3, 8, 8], "action_dim": 1, "discrete": False}
 
@@ -47,3 +52,17 @@ def test_frames_of_episodes_are_predicted_as_digits_are(run, tmp_path):
 def test_what_is_no_drawing_of_strokes_has_no_probabilities(run, capsys, tmp_path):
     sentence = error_of(capsys, "figures", "4", "--runs", run, "--mean", "-o", tmp_path / "figures")
     assert sentence == f"--mean: the frames of {run} are expectations anyway, not sampled. Leave it out"
+
+
+def test_truth_has_the_grey_values_of_its_completions(run):
+    """A frame of one byte is as bright as its mean, not as the brightest pixel of the batch."""
+    loaded = load_runs([run])[0]
+    batch = loaded.data.sequences("test", torch.arange(2))
+    grey = batch._replace(observation=torch.full_like(batch.observation, 102))
+
+    (truth, seen, _) = prediction_grid(loaded.model, loaded.data, grey, 3, 1).axes[:3]
+    figure = predictions(group([loaded]), loaded.data.source, grey, 6, 3, 1)
+
+    for axes in (truth, seen, *figure.axes[:2]):
+        frame = axes.images[0].get_array()
+        assert frame[4, 4].tolist() == pytest.approx([102 / 255] * 3)

@@ -16,7 +16,7 @@ from forbes.data.episodes.worker import EpisodeWorker
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.distributed import gathered, num_ranks, rank
 from forbes.envs import TIME_LIMIT, EnvironmentProcess, find_environment
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.factors import Discrete, as_discrete
 from forbes.shapes import Shape, shape_of
 
@@ -37,7 +37,8 @@ class Experience(SequenceSource):
         time_limit: number of steps after which an episode is truncated.
 
     Raises:
-        ForbesError: for an unknown task or option, a timeout that is not above 0, or a time_limit below 1.
+        ForbesError: for an unknown task or option, a timeout that is not above 0, or a capacity or time_limit
+            below 1.
 
     Example:
         >>> source = forbes.Experience("gymnasium:CartPole-v1", options={"action_repeat": 2})
@@ -58,6 +59,8 @@ class Experience(SequenceSource):
             raise ForbesError(
                 f"Experience: timeout is {timeout}, expected seconds above 0, at most {LONGEST}. Choose another"
             )
+        if capacity is not None:
+            require_at_least(1, "Experience", capacity=capacity)
         if time_limit < 1:
             raise ForbesError(f"Experience: time_limit is {time_limit}, expected at least 1 step. Choose another")
         self.task, self.options, self.capacity = task, options or {}, capacity

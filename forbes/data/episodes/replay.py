@@ -226,6 +226,11 @@ class Replay(SequenceSource):
     def _require(self, split: Split) -> _Table:
         """Return the table of a split; raise a ForbesError if it has no episodes."""
         table = self._tables[split]
+        if not table.numbers and not self.hold_out and split != "train":
+            raise ForbesError(
+                f"{self.path}: hold_out is 0, so the {split} split has no episodes. Set hold_out; a training can do "
+                "without: trainer.limit_val_batches 0"
+            )
         if not table.numbers:
             raise ForbesError(
                 f"{self.path}: the {split} split has no episodes, expected one out of {self.hold_out}. Collect more, "

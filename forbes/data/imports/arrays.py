@@ -13,7 +13,9 @@ from forbes.errors import ForbesError
 
 __all__ = ["Arrays"]
 
-_TERMINATED = ("terminals", "terminations", "terminated", "dones", "done")
+_AT_ANY_END = ("dones", "done")
+"""Names of flags that are often set at a time limit too."""
+_TERMINATED = ("terminals", "terminations", "terminated", *_AT_ANY_END)
 _TRUNCATED = ("timeouts", "truncations", "truncated", "is_last")
 _POSITIONS = ("episode_ends", "meta/episode_ends")
 
@@ -22,7 +24,8 @@ class Arrays(Reader):
     """Index t holds (o_t, a_t, r_t). The last observation is in `next_observations`, if the file has it.
 
     Ends are flags (`terminals` and `timeouts`, or other usual names) at the last step of an episode, or numbers of
-    steps up to the end of each (`episode_ends`). Steps after the last flag are an episode that was truncated.
+    steps up to the end of each (`episode_ends`). Steps after the last flag are an episode that was truncated. `dones`
+    end an episode, and terminate it if there are no `terminals` and it is not marked as truncated.
     """
 
     name = "arrays"
@@ -49,9 +52,13 @@ class Arrays(Reader):
                     f"{path}: {name} has {len(arrays[name])} steps, expected {steps}, since episodes end there"
                 )
         self._arrays = {name: array for name, array in arrays.items() if array.shape[:1] == (steps,)}
-        self._terminals = _flags(self._arrays, _TERMINATED, steps)
+        truncated = _flags(self._arrays, _TRUNCATED, steps)
         if positions is None:
-            positions = np.flatnonzero(self._terminals | _flags(self._arrays, _TRUNCATED, steps)) + 1
+            positions = np.flatnonzero(_flags(self._arrays, _TERMINATED, steps) | truncated) + 1
+        told = next((name for name in _TERMINATED if name in self._arrays), None)
+        self._terminals = _flags(self._arrays, [told] if told else [], steps)
+        if told in _AT_ANY_END:
+            self._terminals &= ~truncated
         ends = np.union1d(positions, [steps]) if flags else positions  # steps after the last flag are an episode, too
         starts = np.concatenate([[0], ends[:-1]])
         if (ends <= starts).any():

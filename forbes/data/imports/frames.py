@@ -1,6 +1,7 @@
 """Folders of pictures or videos, with a CSV of the actions of each episode."""
 
 import csv
+import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,9 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 class Frames(Reader):
     """An episode is a folder of pictures and one `.csv`, or a video and the `.csv` of the same name.
 
-    Pictures are in the order of their names. The CSV has a line of names, and one line of numbers per frame, in which
-    the action follows the frame; that of the last frame may be missing. Columns `reward` and `terminated` are what they
+    Pictures are in the order of their names, numbers in them as numbers. The CSV has a line of names, and one line of
+    numbers per frame, in which the action follows the frame; that of the last frame may be missing, and if it is there,
+    its action leads nowhere and its `terminated` is that of the frame. Columns `reward` and `terminated` are what they
     say, all others are the action.
     """
 
@@ -74,7 +76,12 @@ def _videos(table: Path) -> list[Path]:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _PICTURES)
+    return sorted((path for path in folder.iterdir() if path.suffix.lower() in _PICTURES), key=_numbers_as_numbers)
+
+
+def _numbers_as_numbers(path: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts 9.png before 10.png."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def _images(frames: Path) -> Iterator[NDArray[Any]]:

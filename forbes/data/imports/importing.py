@@ -28,8 +28,8 @@ def is_imported(source: Source, output: Path) -> bool:
     """
     if not output.exists():
         return False
-    records = EpisodeStore(output).records if output.is_dir() else {}
-    if len(records) == len(source) and all(record.environment == source.describe() for record in records.values()):
+    store = EpisodeStore(output) if output.is_dir() else None
+    if store and len(store.records) == len(source) and all(_holds(store, n, source) for n in (0, len(source) - 1)):
         return True
     raise ForbesError(f"{output}: exists and is not a store of {source.path}. Choose another folder, or delete it")
 

@@ -183,6 +183,11 @@ class Source:
                 f"o_t. {REMEDY}"
             )
         self.drops_last = shift_allowed == 1 and count == len(action)
+        if self.drops_last and recorded.terminated and reward[-1] != 0:
+            raise ForbesError(
+                f"{recorded.where}: its last line has a reward and is terminated, but no observation follows it. Add "
+                "that observation, or remove the line"
+            )
         kept = (count - 1) // self.every  # T
         used = kept * self.every
         action = self._vectors(recorded, (action[1:] if reader.actions_lead else action)[:used])  # (kT, A)

@@ -9,7 +9,7 @@ import torch
 from toy_environments import Echo
 
 from forbes.commands.cli import main
-from forbes.data import Replay, SequenceDataModule
+from forbes.data import Experience, Replay, SequenceDataModule
 from forbes.data.episodes.collection import play, random_policy
 from forbes.data.episodes.episode import Episode, pack_episode
 from forbes.data.episodes.store import EpisodeWriter
@@ -266,6 +266,10 @@ def test_an_empty_store_and_an_empty_split_are_one_sentence(tmp_path, path):
         Replay(str(tmp_path / "empty"))
     with pytest.raises(ForbesError, match=r"the test split has no episodes, expected one out of 10\. Collect more"):
         next(iter(SequenceDataModule(Replay(str(path))).test_dataloader()))
+    with pytest.raises(ForbesError, match="hold_out is 0, so the validation split has no episodes. Set hold_out"):
+        next(iter(SequenceDataModule(Replay(str(path), hold_out=0)).val_dataloader()))
+    with pytest.raises(ForbesError, match="Experience: capacity is 0, expected at least 1"):
+        Experience("tiger", capacity=0)
 
 
 def test_a_damaged_episode_ends_the_training_with_its_name(path):

@@ -1,5 +1,8 @@
 """Imported episodes have at index t the action and the reward that led to o_t, whatever their format has there."""
 
+import shutil
+
+import h5py
 import numpy as np
 import pytest
 import recordings
@@ -48,3 +51,33 @@ def test_a_picture_is_that_of_the_action_that_led_to_it(name, tmp_path):
         expected = recordings.pictures(theirs.action)[..., :16, :16]
         assert np.abs(ours.observation.astype(int) - expected).max() <= (0 if name in ("dreamer", "png") else 3)
         np.testing.assert_array_equal(ours.action, theirs.action)
+
+
+def test_numbers_of_pictures_need_no_zeros(tmp_path):
+    """As text, 10.png is before 2.png."""
+    recorded = recordings.episodes(count=8, images=True)
+    assert max(len(episode.observation) for episode in recorded) > 10
+    whole = recordings.write("png", tmp_path / "whole", recorded)
+    short = tmp_path / "short"
+    shutil.copytree(whole, short)
+    for picture in short.glob("*/*.png"):
+        picture.rename(picture.with_name(f"{int(picture.stem)}.png"))
+
+    ours, theirs = source(short, "png"), source(whole, "png")
+
+    for number in range(len(recorded)):
+        np.testing.assert_array_equal(ours.episode(number).observation, theirs.episode(number).observation)
+
+
+@pytest.mark.parametrize("with_terminals", [True, False])
+def test_dones_at_a_time_limit_are_no_terminations(with_terminals, tmp_path):
+    recorded = recordings.episodes(count=5)
+    path = recordings.write("d4rl", tmp_path / "recorded.hdf5", recorded)
+    with h5py.File(path, "r+") as file:
+        file["dones"] = file["terminals"][:] | file["timeouts"][:]
+        if not with_terminals:
+            del file["terminals"]
+
+    found = source(path, "d4rl")
+
+    assert [found.episode(number).terminated for number in range(5)] == [episode.terminated for episode in recorded]

@@ -262,6 +262,7 @@ CSV = {
     "line 3 has 2 values, expected 3": "push,reward,terminated\n0.1,0,0\n0.2,0\n",
     "could not convert string to float": "push,reward,terminated\n0.1,0,0\nleft,0,0\n",
     "has no column for the action": "reward,terminated\n0,0\n0,0\n",
+    "its last line has a reward and is terminated": "push,reward,terminated\n" + "0.1,0,0\n" * 4 + "0.2,1,1\n",
     "unequal lengths: 5 observations, 2 actions": "push,reward,terminated\n0.1,0,0\n0.2,0,0\n",
 }
 

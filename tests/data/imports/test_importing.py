@@ -1,6 +1,7 @@
 """An import ends with a whole store or with none, after a kill too, and needs the memory of one episode."""
 
 import os
+import shutil
 import signal
 import tracemalloc
 import warnings
@@ -106,6 +107,11 @@ def test_a_folder_with_anything_else_is_left_alone(recorded, tmp_path):
     with pytest.raises(ForbesError, match=r"store: exists and is not a store of"):
         is_imported(source(recorded, reward="action"), tmp_path / "store")
     assert not is_imported(source(recorded), tmp_path / "new")
+
+    shutil.rmtree(recorded)  # recorded again, with as many episodes
+    recordings.write("dreamer", recorded, recordings.episodes(6, seed=1))
+    with pytest.raises(ForbesError, match=r"store: exists and is not a store of"):
+        is_imported(source(recorded), tmp_path / "store")
 
 
 def test_memory_is_that_of_an_episode(tmp_path):
