@@ -145,8 +145,8 @@ def _show(path: str) -> None:
         metrics = read_metrics(path)
         for name in _curves(list(metrics)):
             of_one = metrics[name].dropna()
-            last = f"; last {_value(float(of_one.iloc[-1]))}" if len(of_one) else ""
-            print(f"\n{name}, by update{last}")
+            ended = f"; last {_value(float(of_one.iloc[-1]))}" if len(of_one) else ""
+            print(f"\n{name}, by update{ended}")
             print(*curve(of_one.index.tolist(), of_one.tolist(), _WIDTH), sep="\n")
     if scores := _recorded(RunFolder(path).results / "evaluation.json"):
         print("\nrecorded scores, mean ± standard error")
