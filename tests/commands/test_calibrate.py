@@ -1,5 +1,6 @@
 """`forbes calibrate`, as a user calls it."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -33,7 +34,13 @@ def test_it_prints_the_coverage_and_draws_the_ranks(run, tmp_path, capsys):
     assert "60 states sampled from the model" in out
     assert "within 90 %" in out
     assert "p, classifier" in out
-    assert {path.name for path in tmp_path.iterdir()} == {"calibration.png", "calibration.pdf"}
+    assert {path.name for path in tmp_path.iterdir()} == {f"calibration.{kind}" for kind in ("png", "pdf", "json")}
+    record = json.loads((tmp_path / "calibration.json").read_text())
+    assert (record["sequences"], record["samples"], record["time"], record["seed"]) == (60, 19, 3, 0)
+    (tested,) = record["runs"]
+    assert tested["run"] == run
+    assert f"{tested['within_90']:.1%}" in out
+    assert all(f"{tested[f'p_{name}']:.2g}" in out for name in ("density", "tarp", "values", "classifier"))
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ States and observations are sampled from the model's own prior. The model filter
 state is ranked among samples of the belief. If the filter is exact, the ranks are uniform. A small p-value shows that
 it is not; if fewer than 90 % of the states lie in the 90 % region, the beliefs are too narrow. This is expected of a
 filter trained with the ELBO. Ranks are tested by Pearson's test, TARP's f by the Kolmogorov-Smirnov test, and a
-classifier tries to separate sampled states from samples of the beliefs. Prints a table, and draws calibration.png and
-calibration.pdf."""
+classifier tries to separate sampled states from samples of the beliefs. Prints a table, writes it to calibration.json,
+and draws calibration.png and calibration.pdf."""
 
 
 def parser() -> RunsParser:
