@@ -14,7 +14,7 @@ from forbes.commands.evaluate import evaluate, wanted_metrics
 from forbes.commands.evaluate import main as evaluate_command
 from forbes.commands.jobs import Launcher, run_jobs
 from forbes.commands.launchers import open_launcher
-from forbes.commands.parsers.compare import parser, require_sweep
+from forbes.commands.parsers.compare import parser, require_no_scores, require_sweep
 from forbes.commands.sweep import sweep
 from forbes.commands.trainings import Training, complete_configuration, failures, not_finished, training_job
 from forbes.errors import ForbesError
@@ -50,6 +50,8 @@ def main(argv: Sequence[str]) -> None:
         for seed, run in of_config.items()
     ]
     agents = _require_measurable(args, flags)
+    if agents:
+        require_no_scores(args, "agents are compared by their returns", {"seed", "device"})
     _train(trainings, launcher)
     if agents:
         runs = [training.folder for training in trainings]
@@ -95,7 +97,8 @@ def _require_measurable(args: Any, flags: Sequence[str]) -> bool:
         config = yaml.safe_load(complete_configuration(name, *flags))
         if config["model"]["class_path"].endswith(".KnownBelief"):
             raise ForbesError(f"{name}: beliefs of a known process have scores of their own. Use forbes beliefs")
-        kinds.add(config["data"]["init_args"]["source"]["class_path"].endswith(".Experience"))
+        source = config["data"].get("init_args", {}).get("source") or {}  # data of a user's own may have none
+        kinds.add(str(source.get("class_path")).endswith(".Experience"))
         if is_world(config):
             world, data = build_world(config, Path(name), args.output)
             untrained.append(TrainedRun(name, world.model, data, checkpoint="", config=config))

@@ -36,6 +36,7 @@ from forbes.evaluation.runs import (
     find_device,
     is_agent,
     require_comparable,
+    require_distinct,
     split_batches,
 )
 from forbes.evaluation.scoring import (
@@ -73,6 +74,7 @@ def main(argv: Sequence[str]) -> None:
 
 def _main(argv: Sequence[str]) -> None:
     args = parser().parse_args(argv)
+    require_distinct(args.runs)
     command = command_line("evaluate", *argv)
     if args.checkpoint is not None:
         args.runs = [str(Path(run) / "checkpoints" / args.checkpoint) for run in args.runs]

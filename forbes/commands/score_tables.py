@@ -115,7 +115,7 @@ def _table(task: str, kind: str, families: Mapping[str, Sequence[Run]]) -> Table
 def _cell(runs: Sequence[Run], score: str) -> str:
     """Return the mean of a score over seeds, with the lowest and highest, where all were measured alike."""
     found = [one for run in runs if (one := entry_of(run.folder, score))]
-    if len({name for name, _ in found}) > 1:
+    if len({(name, entry.get("data", {}).get("sha256")) for name, entry in found}) > 1:
         return "measured differently"
     entries = [entry for _, entry in found]
     means = [entry["per_step"]["mean"] if score in _PER_STEP else entry["mean"] for entry in entries]

@@ -96,8 +96,8 @@ def _common(families: Sequence[RunFamily], score: str) -> str:
     first, *others = [_entries(run) for run in runs]
     names = [name for name in first if score_of(name) == score]
     for name in sorted(names, key=lambda name: first[name]["sequences"], reverse=True):
-        hashes = {first[name]["data"]["sha256"], *(other[name]["data"]["sha256"] for other in others if name in other)}
-        if len(hashes) == 1 and all(name in other for other in others):
+        entries = [found[name] for found in (first, *others) if name in found]
+        if len({(one["data"]["sha256"], len(one["curve"])) for one in entries}) == 1 and len(entries) == len(runs):
             return name
     lacking = next((run for run in runs if not any(score_of(name) == score for name in _entries(run))), runs[0])
     raise ForbesError(

@@ -11,13 +11,7 @@ from forbes.models.base import ModelFamily, ModelParts
 from forbes.models.elbo import KL, FreeNats
 from forbes.models.likelihoods import Likelihood, Normal
 from forbes.models.networks import Activation, ConvDecoder, ConvEncoder, DecoderFamily, EncoderFamily, activate
-from forbes.models.requirements import (
-    likelihood_for,
-    require_closed_form,
-    require_mean,
-    require_path,
-    require_same_states,
-)
+from forbes.models.requirements import likelihood_for, require_mean, require_path, require_same_states
 from forbes.models.state_space import StateSpaceModel
 from forbes.shapes import Shape, size_of
 
@@ -63,7 +57,7 @@ class World(nn.Module):
 
     Raises:
         ForbesError: when a size is below 1, another number below 0, a choice does not exist, or `likelihood`, `prior`,
-            `kl`, `free_nats_per` or `center` does not fit the other arguments.
+            `kl` or `center` does not fit the other arguments.
     """
 
     def __init__(
@@ -118,7 +112,6 @@ class World(nn.Module):
         )
         require_same_states(self.model)
         require_path(kl, self.model)
-        require_closed_form(kl, free_nats_per, self.model)
         self.activation: Activation = activation
         activate(self.model, activation)
         if center:

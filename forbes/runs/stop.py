@@ -25,8 +25,8 @@ class StopOnSignal(Callback):
     SIGUSR1 and SIGUSR2 are sent by SLURM and others before the time is over or a job is preempted. They may come in
     any number, next to one SIGTERM, and never stop a training immediately.
 
-    The state is consistent after the current update. For an agent it is consistent after the epoch, since the episode
-    at the start of the epoch would be missing otherwise.
+    The state is consistent after the current update, unless a validation follows it. For an agent it is consistent
+    after the epoch, since the episode at the start of the epoch would be missing otherwise.
 
     Without this callback, Lightning stops in the middle of an update on Ctrl-C, and saves nothing on either signal.
 

@@ -12,6 +12,7 @@ from torch.optim import Optimizer
 from forbes.data import SequenceBatch, SequenceDataModule
 from forbes.distributed import means_over_ranks, shared_batch, sum_over_ranks
 from forbes.models.elbo import ElboTerms, elbo_loss
+from forbes.models.requirements import require_closed_form
 from forbes.models.world import World
 from forbes.runs.hyperparameters import plain_arguments
 from forbes.runs.modules import load_module
@@ -129,6 +130,10 @@ class WorldModel(World, SeededModule):
     def terms(self, batch: SequenceBatch) -> ElboTerms:
         """Estimate the parts of the bound on a batch."""
         return self.model.lower_bound(batch.observation, batch.action, batch.mask, self.kl)
+
+    def on_fit_start(self) -> None:
+        """Refuse a loss that is not what it says; a model that was trained with one can still be evaluated."""
+        require_closed_form(self.kl, self.free_nats_per, self.model)
 
     def on_train_batch_start(self, batch: SequenceBatch, batch_idx: int) -> None:
         """Seed the noise of this batch; check the first observations of an epoch; measure the mean observation."""

@@ -357,6 +357,7 @@ def test_what_cannot_be_compared_is_refused_before_any_training(configs, tmp_pat
     agent = str(write_config(tmp_path))
     refused = {
         "an agent is compared by its return, a world model by its scores": [configs[0], agent],
+        "--context: agents are compared by their returns. Remove --context": [agent, "--context", "3"],
         "Use forbes beliefs": ["pomdp/linear_gaussian/known_gaussian"],
     }
     for sentence, named in refused.items():

@@ -485,6 +485,7 @@ def test_wrong_arguments_are_named(runs, tmp_path, capsys):
     assert "--episodes: is for agents, and none is named" in refusal(capsys, runs[0], "--episodes", "3")
     agent = str(Path(__file__).parents[1] / "old_runs" / "agent")
     assert "--split: is for world models" in error_of(capsys, "evaluate", agent, "--split", "train")
+    assert "is named twice" in error_of(capsys, "evaluate", agent, f"{agent}/")
     assert "invalid choice: 'bleu'" in refusal(capsys, runs[0], "--scores", "bleu")
     assert "--device moon" in refusal(capsys, runs[0], "--device", "moon")
     assert "no such run folder" in refusal(capsys, str(tmp_path / "nowhere"))

@@ -9,7 +9,8 @@ from torch import nn
 
 from forbes.data import SequenceBatch
 from forbes.errors import ForbesError
-from forbes.evaluation.scoring import PartialScores, Scorer, score_split
+from forbes.evaluation.record import describe
+from forbes.evaluation.scoring import PartialScores, Scorer, Scores, score_split
 
 STEPS = 3
 
@@ -103,3 +104,11 @@ def test_a_batch_has_the_same_noise_whatever_was_scored_before(tmp_path):
 def test_another_error_is_not_taken_for_a_lack_of_memory():
     with pytest.raises(RuntimeError, match="shapes"):
         score_split(nn.Linear(1, 1), batches(), hungry(0, RuntimeError("shapes do not fit")))
+
+
+def test_a_curve_ends_with_the_last_sequence():
+    """Steps that no sequence reaches have no mean; they counted as 0 nats."""
+    values = {"elbo": torch.tensor([[1.0, 2.0, 0.0, 0.0], [3.0, 0.0, 0.0, 0.0]], dtype=torch.float64)}
+    mask = torch.tensor([[True, True, False, False], [True, False, False, False]])
+
+    assert describe(Scores(values, mask), "elbo")["curve"] == [2.0, 2.0]

@@ -347,11 +347,6 @@ BALANCED = partial(CategoricalBelief, classes=2, kl_balance=0.8)
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        ({"free_nats_per": "element"}, "free_nats_per is element, but the KL is estimated by samples"),
-        ({"free_nats_per": "element", "belief": GaussianBelief, "model": ParticleModel}, "estimated by samples"),
-        ({"free_nats_per": "element", "belief": GaussianBelief, "kl": "path"}, "estimated by samples"),
-        ({"belief": BALANCED, "kl": "monte_carlo"}, "kl_balance weighs the gradients of the KL in closed form"),
-        ({"belief": BALANCED, "model": ParticleModel}, "kl_balance weighs the gradients of the KL in closed form"),
         ({"belief": GaussianBelief, "prior": ONE_HOT}, "are real vectors, those of the prior one-hot variables"),
         ({"belief": ONE_HOT, "prior": GaussianBelief}, "one-hot variables of 2 classes, those of the prior real"),
         ({"belief": ONE_HOT, "prior": partial(CategoricalBelief, classes=4)}, "of the prior one-hot variables of 4"),
@@ -368,6 +363,24 @@ BALANCED = partial(CategoricalBelief, classes=2, kl_balance=0.8)
 def test_options_that_do_not_fit_are_refused(flags, message):
     with pytest.raises(ForbesError, match=message):
         make_world_model(**{"state_dim": 4} | flags)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"free_nats_per": "element"}, "free_nats_per is element, but the KL is estimated by samples"),
+        ({"free_nats_per": "element", "belief": GaussianBelief, "model": ParticleModel}, "estimated by samples"),
+        ({"free_nats_per": "element", "belief": GaussianBelief, "kl": "path"}, "estimated by samples"),
+        ({"belief": BALANCED, "kl": "monte_carlo"}, "kl_balance weighs the gradients of the KL in closed form"),
+        ({"belief": BALANCED, "model": ParticleModel}, "kl_balance weighs the gradients of the KL in closed form"),
+    ],
+)
+def test_a_loss_that_needs_a_closed_form_is_not_trained_without(flags, message):
+    """A model that was trained with it can still be loaded."""
+    model = make_world_model(**{"state_dim": 4} | flags)
+
+    with pytest.raises(ForbesError, match=message):
+        fit(model)
 
 
 def test_particles_train_by_the_path_derivative():

@@ -17,7 +17,8 @@ Compare learned beliefs of a known process with the exact ones.
 Prints per step, mean and standard error over sequences:
 
   forward_kl        KL(exact || q) in nats: large if q misses a mode
-  reverse_kl        KL(q || exact) in nats: large if q has mass where the exact belief has none
+  reverse_kl        KL(q || exact) in nats: large if q has mass where the exact belief has little; on a grid, of q given
+                    the grid
   state_nll_regret  log exact(s_t) - log q(s_t) of the true state in nats; its mean is the forward KL
   variance_ratio    tr Var q / tr Var exact: below 1 if q is too certain
   mode_mass_error   half the sum over modes of |q - exact|, if the process can have several modes

@@ -1,5 +1,6 @@
 """The arguments of `forbes compare`."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ from forbes.commands.parsers.evaluate import add_score_options
 from forbes.commands.parsers.launchers import add_launcher_options
 from forbes.errors import ForbesError
 
-__all__ = ["parser", "require_sweep"]
+__all__ = ["parser", "require_no_scores", "require_sweep"]
 
 _DESCRIPTION = """\
 Train configurations with several seeds, evaluate all runs on the same sequences, and compare them.
@@ -18,8 +19,8 @@ Train configurations with several seeds, evaluate all runs on the same sequences
 
 Each run has a folder DIR/NAME-SEED. Arguments after -- are passed to every `forbes fit`. Runs that have no scores yet
 are then evaluated as by `forbes evaluate`. Writes comparison.csv, .json and .md, and figures: scores, per-step,
-differences (to the first configuration). Agents are compared by their returns, in the tables of `forbes evaluate`. If
-interrupted, the same command resumes where it stopped.
+differences (to the first configuration). Agents are compared by their returns, in the tables of `forbes evaluate`, and
+play anew each time. If interrupted, the same command resumes where it stopped.
 
   forbes compare strokes/{rssm,forbes,mixture} --seeds 5 --jobs 2     # two trainings at a time, a progress line each
   forbes compare strokes/rssm strokes/forbes --launcher ray --gpus-per-job 0.25
@@ -69,9 +70,14 @@ def require_sweep(args: Any) -> None:
         raise ForbesError(
             f"--sweep: takes one configuration, found {', '.join(args.configs)}. Sweep one after the other"
         )
+    require_no_scores(args, "a sweep is ranked by its validation, nothing is evaluated")
+
+
+def require_no_scores(args: Any, reason: str, used: Collection[str] = ()) -> None:
+    """Raise a ForbesError for an option of the evaluation that has no effect, all but those that are used."""
     scores = ArgumentParser("", "")
     add_score_options(scores)
     for name, default in vars(scores.parse_args([])).items():
-        if getattr(args, name) != default:
+        if name not in used and getattr(args, name) != default:
             flag = name.replace("_", "-")
-            raise ForbesError(f"--{flag}: a sweep is ranked by its validation, nothing is evaluated. Remove --{flag}")
+            raise ForbesError(f"--{flag}: {reason}. Remove --{flag}")
