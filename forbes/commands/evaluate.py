@@ -234,7 +234,7 @@ def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
     counts = {name: _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else SUBSET) for name in scorers}
     hashes = {count: _require_same_data(runs, args, count) for count in dict.fromkeys(counts.values())}
     if "open-loop" in counts:
-        _require_longer(runs[0], args, counts["open-loop"])
+        require_longer(runs[0].path, runs[0].data, args.split, counts["open-loop"], args.context)
     return [_Job(name, scorer, counts[name], hashes[counts[name]]) for name, scorer in scorers.items()]
 
 
@@ -257,12 +257,6 @@ def _require_same_data(runs: Sequence[TrainedRun], args: Any, count: int) -> lis
     hashes = [data_sha256(run.data, args.split, count) for run in runs]
     require_comparable(runs, hashes)
     return hashes
-
-
-def _require_longer(run: TrainedRun, args: Any, count: int) -> None:
-    """Refuse sequences that end within the context, before minutes are spent on other scores."""
-    for first, batch in split_batches(run.data, args.split, count, batch_size=500):
-        require_longer(f"{run.path}, {args.split} split", first, batch, args.context)
 
 
 def _of(run: TrainedRun, jobs: Sequence[_Job]) -> list[_Job]:

@@ -167,6 +167,7 @@ def evaluate(
         score = make_scorer(name, numbers[PASSES[name]], batch_size, context).of(model)
         if not score.metrics:  # the model has none of them
             continue
+        require_longer("evaluate", data, split, count, score.context)
         scored = score_split(model, split_batches(data, split, count, score.batch_size), score, seed)
         found |= {metric: Estimate.of(scored.total(metric)) for metric in score.metrics}
     return found
@@ -243,14 +244,12 @@ def score_split(
         per_rank: whether all ranks call this, and share the batches out. Each gets all scores.
 
     Raises:
-        ForbesError: if a score is not finite or a sequence ends within the context (names the sequence), or if the
-            memory does not suffice for one sequence.
+        ForbesError: if a score is not finite (names the sequence), or if the memory does not suffice for one sequence.
     """
     device = next(model.parameters()).device
     of_rank: dict[int, Scores] = {}  # by the index of the first sequence
     mine = itertools.islice(batches, rank(), None, num_ranks()) if per_rank else batches
     for first, batch in mine:
-        require_longer(where, first, batch, score.context)
         values = parts.read(first) if parts else None
         if values is None:
             values = _score(model, first, batch.to(device), score, seed, where)
@@ -291,15 +290,16 @@ def _out_of_memory(error: RuntimeError) -> bool:
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
-def require_longer(where: str, first: int, batch: SequenceBatch, context: int) -> None:
-    """Raise a ForbesError that names a sequence, counted from `first`, that ends within the context."""
-    length = batch.mask.sum(1)  # (B,)
-    row = int(length.argmin())
-    if length[row] <= context:
-        raise ForbesError(
-            f"{where}: sequence {first + row} has {length[row]} steps, expected more than the context of {context}. "
-            "Choose a smaller context, or other scores"
-        )
+def require_longer(where: str, data: SequenceData, split: Split, count: int, context: int) -> None:
+    """Raise a ForbesError if one of the first `count` sequences ends within the context: no step is left to score."""
+    for first, batch in split_batches(data, split, count, batch_size=500):
+        length = batch.mask.sum(1)  # (B,)
+        row = int(length.argmin())
+        if length[row] <= context:
+            raise ForbesError(
+                f"{where}, {split} split: sequence {first + row} has {length[row]} steps, expected more than the "
+                f"context of {context}. Choose a smaller context, or other scores"
+            )
 
 
 def require_finite(where: str, first: int, scores: Increments) -> None:
