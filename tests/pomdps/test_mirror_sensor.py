@@ -76,5 +76,5 @@ def test_a_belief_that_has_lost_a_mode_predicts_as_well():
 
 @pytest.mark.parametrize(("name", "value"), [("observation_std", 0.0), ("cells", 1)])
 def test_what_makes_no_sensor_is_one_sentence(name, value):
-    with pytest.raises(ForbesError, match=f"^MirrorSensor: {name} is 0"):
+    with pytest.raises(ForbesError, match=f"^MirrorSensor: {name} is {value}, expected"):
         MirrorSensor(**{name: value})
