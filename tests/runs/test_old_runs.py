@@ -20,7 +20,10 @@ def old_run(request, tmp_path):
 
 
 def test_an_old_run_is_evaluated(old_run):
-    of_agent, of_world = ["--episodes", "2"], ["--sequences", "4", "--particles", "2", "--futures", "2", "--context", "2"]
+    of_agent, of_world = (
+        ["--episodes", "2"],
+        ["--sequences", "4", "--particles", "2", "--futures", "2", "--context", "2"],
+    )
 
     assert main(["evaluate", str(old_run), *(of_agent if old_run.path.name == "agent" else of_world)]) == 0
 
