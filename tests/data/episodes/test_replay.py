@@ -266,7 +266,7 @@ def test_an_empty_store_and_an_empty_split_are_one_sentence(tmp_path, path):
         Replay(str(tmp_path / "empty"))
     with pytest.raises(ForbesError, match=r"the test split has no episodes, expected one out of 10\. Collect more"):
         next(iter(SequenceDataModule(Replay(str(path))).test_dataloader()))
-    with pytest.raises(ForbesError, match="hold_out is 0, so the validation split has no episodes. Set hold_out"):
+    with pytest.raises(ForbesError, match=r"hold_out is 0, so the validation split has no episodes\. Set hold_out"):
         next(iter(SequenceDataModule(Replay(str(path), hold_out=0)).val_dataloader()))
     with pytest.raises(ForbesError, match="Experience: capacity is 0, expected at least 1"):
         Experience("tiger", capacity=0)
