@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping
 
-import torch
-
 from forbes.beliefs import CategoricalBelief
 from forbes.errors import ForbesError
 from forbes.models.base import BeliefModel
@@ -50,7 +48,7 @@ def require_closed_form(kl: KL, free_nats_per: FreeNats, model: BeliefModel) -> 
     """Raise a ForbesError if an option is asked for that needs the KL in closed form, and the model has none."""
     if not isinstance(model, StateSpaceModel):
         return
-    context = torch.zeros(1, model.posterior.context_dim)  # (1, C)
+    context = next(model.parameters()).new_zeros(1, model.posterior.context_dim)  # (1, C), on the model's device
     if (
         kl == "analytic"
         and not isinstance(model, ParticleModel)
