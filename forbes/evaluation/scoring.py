@@ -167,7 +167,8 @@ def evaluate(
         score = make_scorer(name, numbers[PASSES[name]], batch_size, context).of(model)
         if not score.metrics:  # the model has none of them
             continue
-        require_longer("evaluate", data, split, count, score.context)
+        if score.context:
+            require_longer("evaluate", data, split, count, score.context)
         scored = score_split(model, split_batches(data, split, count, score.batch_size), score, seed)
         found |= {metric: Estimate.of(scored.total(metric)) for metric in score.metrics}
     return found
