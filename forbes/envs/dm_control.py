@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.envs.base import Environment, Step, repeat, require_repeat, scale_action
+from forbes.envs.images import RENDERED_SIZE
 from forbes.envs.rendering import choose_backend
 from forbes.envs.views import VELOCITIES
 from forbes.errors import ForbesError, require_at_least
@@ -90,7 +91,7 @@ class DeepMindControl(Environment):
         for name, value in (("camera", camera), ("size", size), ("fast", fast or None)):
             if value is not None and not pixels:
                 raise ForbesError(f"{task}: {name} is for images, expected pixels. Leave {name} out")
-        size = 64 if size is None else size
+        size = RENDERED_SIZE if size is None else size
         require_at_least(1, task, size=size)
         self.task, self.pixels, self.action_repeat, self.size, self.fast = task, pixels, action_repeat, size, fast
         self.proprio = proprio

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forbes.envs.base import Environment, Step, repeat, require_repeat
-from forbes.envs.images import to_image
+from forbes.envs.images import RENDERED_SIZE, to_image
 from forbes.envs.views import VELOCITIES
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.factors import discrete_of
 from forbes.shapes import Observed, map_parts, part_name
 
@@ -69,7 +69,9 @@ class Gymnasium(Environment):
         require_repeat(task, action_repeat)
         self.task, self.pixels, self.action_repeat = task, pixels, action_repeat
         self.options = {name: value for name, value in (("part", part), ("parts", parts)) if value is not None}
-        self.size = size or 64 if pixels else size
+        self.size = RENDERED_SIZE if pixels and size is None else size
+        if self.size is not None:
+            require_at_least(1, task, size=self.size)
         self._environment = _make(task, pixels)
         from forbes.envs import gymnasium_spaces
 

@@ -5,10 +5,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CHANNELS", "to_image"]
+__all__ = ["CHANNELS", "RENDERED_SIZE", "to_image"]
 
 CHANNELS = (1, 3, 4)
 """Possible numbers of channels of an image."""
+
+RENDERED_SIZE = 64
+"""Side of a rendered image in pixels, unless another is chosen."""
 
 
 def to_image(pixels: Any, size: int | None = None) -> NDArray[np.uint8]:

@@ -54,7 +54,8 @@ class WorldModel(World, SeededModule):
             "path": at the posterior's sample, through the sample alone. "monte_carlo": through the posterior's
             parameters too; this noise costs a flow thousands of updates. Of a `ParticleModel`, "analytic" is this.
         free_nats: the KL below this, in nats per step, costs nothing in training.
-        free_nats_per: "batch" applies them to the mean over batch and time, "element" to each step.
+        free_nats_per: "batch" applies them to the mean over batch and time, "element" to each step, for a KL in closed
+            form.
         kl_warmup: updates over which the weight of the KL rises from 0 to 1.
         learning_rate: learning rate of Adam (eps 1e-7).
         schedule: "constant", or "cosine" to 0 at the end of the training.
@@ -65,8 +66,8 @@ class WorldModel(World, SeededModule):
         seed: random seed of the noise of training and validation.
 
     Raises:
-        ForbesError: when a size is below 1, the learning rate or `clip_norm` below 0, or `likelihood` or `center` does
-            not fit the other arguments.
+        ForbesError: when a size is below 1, another number below 0, a choice does not exist, or `likelihood`, `prior`,
+            `kl` or `center` does not fit the other arguments.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)

@@ -9,6 +9,7 @@ import pytest
 from forbes.commands.cli import COMMANDS
 from forbes.commands.parsers.fit import DESCRIPTION
 from forbes.envs import DeepMindControl, Gymnasium
+from forbes.envs.images import RENDERED_SIZE
 
 
 def options_of(parser, name):
@@ -46,7 +47,7 @@ def test_the_help_of_an_option_states_its_default(action):
     ("option", "flag", "stated"),
     [
         ("action_repeat", "--action-repeat", "default: {suite} in DeepMind Control, {gymnasium} in Gymnasium"),
-        ("size", "--size", "default: {suite} if they are rendered"),
+        ("size", "--size", f"default: {RENDERED_SIZE} if they are rendered"),
         ("pixels", "--no-pixels", "default: images in DeepMind Control only"),
     ],
 )

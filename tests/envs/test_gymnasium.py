@@ -132,6 +132,12 @@ def test_pixels_are_what_it_draws_made_smaller():
     assert not frame[:, :, 5:].any()
 
 
+@pytest.mark.parametrize("pixels", [False, True])
+def test_an_image_has_a_pixel_at_least(pixels):
+    with pytest.raises(ForbesError, match="size is 0, expected at least 1"):
+        Gymnasium("forbes/Camera-v0", pixels=pixels, size=0)
+
+
 @pytest.mark.parametrize(
     ("task", "sentence"),
     [
