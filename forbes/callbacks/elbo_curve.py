@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from forbes.callbacks.picture import PictureCallback, require_validation
+from forbes.callbacks.picture import PictureCallback, require_metrics, require_validation
 from forbes.data import SequenceDataModule
 from forbes.errors import require_at_least
 from forbes.evaluation.references import reference_means
@@ -45,8 +45,9 @@ class ElboCurve(PictureCallback):
         self.sequences = sequences
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse data without a validation split when the training starts."""
+        """Refuse data without a validation split, and trainings without metrics.jsonl, when the training starts."""
         require_validation(self, trainer)
+        require_metrics(self, trainer)
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:
         """Draw the curves."""

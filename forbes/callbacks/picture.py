@@ -18,6 +18,7 @@ from forbes.figures.grids import require_images
 from forbes.figures.style import save_figure
 from forbes.models import StateSpaceModel
 from forbes.runs.loggers import show_picture, shows
+from forbes.runs.metrics_log import JsonLinesLogger
 from forbes.seeding import derive_seed, forked
 from forbes.training.world_model import WorldModel
 
@@ -26,6 +27,7 @@ __all__ = [
     "PictureCallback",
     "require_context",
     "require_frames",
+    "require_metrics",
     "require_one_array",
     "require_state",
     "require_validation",
@@ -34,7 +36,7 @@ __all__ = [
 
 
 class FileCallback(Callback, ABC):
-    """Writes a file in the run's `figures/` after every k-th epoch and at the end of the fit.
+    """Writes a file in the run's `figures/` after every k-th epoch and at the end of the fit; none in a dry run.
 
     It uses its own random numbers, so a training with it is bitwise the same as one without. The file of an epoch is
     written at the start of the next one, when all metrics of the epoch are logged. Loggers of TensorBoard and W&B show
@@ -67,6 +69,8 @@ class FileCallback(Callback, ABC):
         self._write(trainer, pl_module)
 
     def _write(self, trainer: Trainer, module: LightningModule) -> None:
+        if trainer.fast_dev_run:  # it has neither a run folder nor metrics
+            return
         folder = trainer.log_dir  # a collective operation, so every process must call it
         if folder is None or not trainer.is_global_zero:
             return
@@ -129,6 +133,15 @@ def require_context(callback: Callback, trainer: Trainer, context: int) -> None:
     if context >= length:
         name = type(callback).__name__
         raise ForbesError(f"{name}: context is {context}, expected less than the length {length}. Choose a smaller one")
+
+
+def require_metrics(callback: Callback, trainer: Trainer) -> None:
+    """Raise a ForbesError if the training does not write the `metrics.jsonl` that the callback draws."""
+    if not trainer.fast_dev_run and not any(isinstance(logger, JsonLinesLogger) for logger in trainer.loggers):
+        raise ForbesError(
+            f"{type(callback).__name__}: draws metrics.jsonl, which this training does not write. Remove this callback, "
+            "or keep the logger of `forbes fit`"
+        )
 
 
 def require_state(callback: Callback, module: LightningModule) -> None:

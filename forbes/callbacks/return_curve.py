@@ -6,7 +6,7 @@ from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 
 from forbes.callbacks.collect import require_agent
-from forbes.callbacks.picture import PictureCallback
+from forbes.callbacks.picture import PictureCallback, require_metrics
 from forbes.data import Experience, SequenceDataModule
 from forbes.data.datamodule import datamodule_of
 from forbes.figures.returns import return_curve
@@ -30,7 +30,8 @@ class ReturnCurve(PictureCallback):
         every: number of epochs between plots.
 
     Raises:
-        ForbesError: at the start of a fit, if the model is not an agent, or the file is invalid or lacks the task.
+        ForbesError: at the start of a fit, if the model is not an agent, the file is invalid or lacks the task, or no
+            metrics.jsonl is written.
     """
 
     filename = "return.png"
@@ -40,8 +41,9 @@ class ReturnCurve(PictureCallback):
         self.reference = reference
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Refuse models and files that cannot be drawn when the training starts."""
+        """Refuse what cannot be drawn when the training starts."""
         require_agent(self, trainer, pl_module)
+        require_metrics(self, trainer)
         self._published(datamodule_of(trainer))
 
     def draw(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule) -> Figure:

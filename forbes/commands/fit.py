@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -215,12 +216,16 @@ class _Experiment(LightningCLI):
             callbacks.append(progress())
         if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
             plugins.append(AtomicCheckpointIO())
-        if self.command != "fit" or config["fast_dev_run"]:
+        if self.command == "fit" and not config["fast_dev_run"]:
+            given = self._run_arguments(config, callbacks)
+        else:  # writes nothing; the episodes that an agent plays in a dry run do not outlive it
             self.save_config_callback = None
             given = {"logger": False, "enable_checkpointing": False}
-        else:
-            given = self._run_arguments(config, callbacks)
-        return super().instantiate_trainer(**given, callbacks=callbacks, plugins=plugins, **kwargs)
+            given["default_root_dir"] = self.stack.enter_context(TemporaryDirectory(prefix="forbes-"))
+        trainer = super().instantiate_trainer(**given, callbacks=callbacks, plugins=plugins, **kwargs)
+        if config["limit_val_batches"] == 0:
+            trainer.limit_val_batches = 0  # Lightning sets 1 in a dry run
+        return trainer
 
     def _run_arguments(self, config: Any, callbacks: list[Any]) -> dict[str, Any]:
         """Open the run folder, add the callbacks that write to it, and return the trainer's arguments that name it."""

@@ -128,7 +128,15 @@ def test_drawing_leaves_random_state_and_module_as_they_were(callback, tiny_run,
     before = torch.get_rng_state()
 
     callback.on_fit_end(
-        SimpleNamespace(log_dir=str(tmp_path), is_global_zero=True, global_step=10, datamodule=data, loggers=[]), module
+        SimpleNamespace(
+            log_dir=str(tmp_path),
+            fast_dev_run=False,
+            is_global_zero=True,
+            global_step=10,
+            datamodule=data,
+            loggers=[],
+        ),
+        module,
     )
 
     assert torch.equal(torch.get_rng_state(), before)

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from command_line import error_of
 from lightning_utilities.core.imports import RequirementCache
+from small_agents import forbes, write_config
 
 from forbes import __version__
 from forbes.commands.cli import COMMANDS, main
@@ -382,10 +383,33 @@ def test_without_logger_or_checkpoints_only_the_record_is_left(tiny_config, in_t
     assert {path.name for path in Path("run").iterdir()} == {".lock", "config.yaml", "provenance.json"}
 
 
+CURVE = ["--trainer.callbacks+", "ElboCurve"]
+
+
 def test_a_dry_run_leaves_nothing(tiny_config, in_tmp_path):
-    assert main(["fit", "--config", str(tiny_config), "--trainer.fast_dev_run", "true"]) == 0
+    assert main(["fit", "--config", str(tiny_config), "--trainer.fast_dev_run", "true", *CURVE]) == 0
 
     assert list(in_tmp_path.iterdir()) == []
+
+
+def test_a_dry_run_of_an_agent_leaves_stored_episodes_alone(in_tmp_path):
+    config = write_config(in_tmp_path)
+    stored = in_tmp_path / "episodes" / "000000.npz"
+    stored.parent.mkdir()
+    stored.write_bytes(b"of the user")
+
+    assert forbes("fit", "--config", config, "--trainer.fast_dev_run", "1", "--trainer.callbacks+", "ReturnCurve") == 0
+
+    assert sorted(in_tmp_path.rglob("*")) == [stored.parent, stored, config]
+
+
+def test_a_picture_of_the_metrics_needs_their_logger(tiny_config, in_tmp_path, capsys):
+    flags = ["--config", str(tiny_config), "--trainer.logger", "false", "--run_dir", "run"]
+
+    sentence = error_of(capsys, "fit", *flags, *CURVE)
+
+    assert sentence.startswith("ElboCurve: draws metrics.jsonl, which this training does not write. Remove this callback")
+    assert not RunFolder("run").checkpoint.exists()
 
 
 @pytest.mark.parametrize("command", ["validate", "test", "predict"])
