@@ -25,7 +25,7 @@ from pathlib import Path
 from train_step import common_options, conditions, publish, say
 
 from forbes.commands.jobs import Job, Launcher, run_jobs
-from forbes.commands.launchers.local import Local
+from forbes.commands.launchers.local import Local, num_cpus
 from forbes.commands.trainings import Training, forbes_command, training_job
 
 EMPTY = 5  # jobs
@@ -60,7 +60,7 @@ def side_by_side(options: argparse.Namespace) -> list[str]:
             say(f"--jobs {at_once}: {found[-1]:.1f} s")
     for at_once, found in times.items():
         took = statistics.median(found)
-        threads = os.environ.get("OMP_NUM_THREADS") or max(1, (os.cpu_count() or 1) // at_once)
+        threads = os.environ.get("OMP_NUM_THREADS") or max(1, num_cpus() // at_once)
         table.append(f"| {at_once} | {threads} | {took:.1f} | {2 * options.updates / took:.2f} |")
     return table
 

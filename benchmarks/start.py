@@ -28,11 +28,13 @@ COMMANDS = {
 
 
 def seconds(arguments, root, folder):
-    """User and system time of a Python process with one thread."""
+    """User and system time of a Python process with one thread; a command that should not fail must not."""
     environment = os.environ | {"PYTHONPATH": str(root.resolve()), "OMP_NUM_THREADS": "1"}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, check=False, **quiet)
+    done = subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, check=False, **quiet)
+    if done.returncode != (2 if "absent" in arguments else 0):
+        raise SystemExit(f"{' '.join(arguments)}: ended with status {done.returncode} in {root}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 

@@ -16,6 +16,9 @@ from rich.text import Text
 
 __all__ = ["Board"]
 
+_PROGRESS = re.compile(r"(?:^epoch|  update|:) (\d+)/(\d+)\b")
+"""How far a job is; the seed episodes of an agent are only its beginning."""
+
 
 class Board:
     """Progress and last line of every running job, and the time left for all of them.
@@ -29,6 +32,7 @@ class Board:
         self._hours, self._later = hours, later
         self._lines: dict[str, str] = {}  # of the running jobs
         self._fractions: dict[str, float] = {}  # done, of each job that has started
+        self._earlier: dict[str, float] = {}  # done by an earlier command, of each job that tells its progress
         self._ended = 0
         self._began = time.monotonic()
         self._lock = threading.Lock()
@@ -39,12 +43,13 @@ class Board:
         return self._live or nullcontext()
 
     def say(self, name: str, line: str) -> None:
-        """Show a line of a job; "17/20" in it is its progress."""
+        """Show a line of a job; its progress is in "epoch 17/20", "update 170/200" or "elbo: 17/20 sequences"."""
         with self._lock:
             self._lines[name] = line
-            if match := re.search(r"\b(\d+)/(\d+)\b", line):
-                done, total = map(int, match.groups())
-                self._fractions[name] = min(done / max(total, 1), 1.0)
+            if match := _PROGRESS.search(line):
+                done, total = int(match[1]), max(int(match[2]), 1)
+                self._fractions[name] = min(done / total, 1.0)
+                self._earlier.setdefault(name, min((done - 1) / total, 1.0))
             if self._live is None:
                 print(f"{name}: {line}", flush=True)
 
@@ -72,10 +77,11 @@ class Board:
 
     def _all_jobs(self) -> str:
         """Return how many jobs have ended, and the time left at the pace so far."""
-        done = sum(self._hours[name] * fraction for name, fraction in self._fractions.items())
-        left = sum(self._hours.values()) - done + self._later
-        pace = (time.monotonic() - self._began) / done if done else 0.0
-        about = f", about {timedelta(seconds=round(pace * left))} left" if done and left > 1e-9 else ""
+        hours = self._hours
+        left = sum(hours.values()) - sum(hours[name] * done for name, done in self._fractions.items()) + self._later
+        here = sum(hours[name] * (done - self._earlier.get(name, 0.0)) for name, done in self._fractions.items())
+        pace = (time.monotonic() - self._began) / here if here else 0.0
+        about = f", about {timedelta(seconds=round(pace * left))} left" if here and left > 1e-9 else ""
         return f"{self._ended} of {len(self._hours)} jobs have ended{about}"
 
     def _render(self) -> Group:

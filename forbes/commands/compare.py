@@ -16,7 +16,7 @@ from forbes.commands.jobs import Launcher, run_jobs
 from forbes.commands.launchers import open_launcher
 from forbes.commands.parsers.compare import parser, require_no_scores, require_sweep
 from forbes.commands.sweep import sweep
-from forbes.commands.trainings import Training, complete_configuration, failures, not_finished, training_job
+from forbes.commands.trainings import Training, complete_configuration, failures, not_finished, unfinished_jobs
 from forbes.errors import ForbesError
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.record import read_record, require_readable, results_folders
@@ -110,10 +110,9 @@ def _require_measurable(args: Any, flags: Sequence[str]) -> bool:
 
 
 def _train(trainings: Sequence[Training], launcher: Launcher) -> None:
-    """Run all trainings to the end. Finished runs return at once."""
-    ended = run_jobs([training_job(training) for training in trainings], launcher)
-    if failed := failures(ended):
-        raise not_finished(failed, len(ended))
+    """Run the trainings that are not finished to the end."""
+    if failed := failures(run_jobs(unfinished_jobs(trainings), launcher)):
+        raise not_finished(failed, len(trainings))
 
 
 def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 import forbes
+from forbes.commands.launchers.local import num_cpus
 from forbes.commands.parsers.doctor import parser
 from forbes.data.download import curves_paths
 from forbes.data.strokes.classifiers import classifiers_path
@@ -84,7 +85,7 @@ def _version(name: str) -> str | None:
 
 def _hardware() -> Iterator[Finding]:
     threads = torch.get_num_threads()
-    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cpus = num_cpus()
     yield Finding("CPUs", f"{cpus}, torch uses {threads} threads", "set OMP_NUM_THREADS" if threads > cpus else "")
     yield from _gpus()
     free = shutil.disk_usage(".").free / 2**30

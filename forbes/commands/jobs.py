@@ -109,6 +109,8 @@ def run_jobs(
         later: hours of the work that follows these jobs, counted in the time left.
         on_end: function called when a job ends, in any thread.
     """
+    if not jobs:
+        return []
     board = Board({job.name: job.hours for job in jobs}, later)
     allowed = [job for job in jobs if not job.refused]
     with (

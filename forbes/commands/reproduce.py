@@ -1,7 +1,6 @@
 """`forbes reproduce`: train, measure and draw what the paper claims, and report what held."""
 
 import json
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from forbes.commands.budgets import Planned, Step, collections, figures, measure
 from forbes.commands.console import console
 from forbes.commands.jobs import Ended, Job, Launcher, run_jobs
 from forbes.commands.launchers import open_launcher
-from forbes.commands.launchers.local import Local
+from forbes.commands.launchers.local import Local, num_cpus
 from forbes.commands.parsers.reproduce import PARTS, parser
 from forbes.commands.report import PAGE, Row, write_report
 from forbes.commands.trainings import failures, forbes_command, is_finished, training_job
@@ -36,7 +35,7 @@ def main(argv: Sequence[str]) -> None:
     folder = args.output or Path("runs/reproduce") / args.budget
     gpu = torch.cuda.is_available()
     jobs_here = args.jobs if args.launcher == "local" else None  # --jobs of a cluster are not of this machine
-    at_once = jobs_here or (1 if gpu else min(os.cpu_count() or 1, 4))
+    at_once = jobs_here or (1 if gpu else min(num_cpus(), 4))
     launcher = open_launcher(args, folder, at_once)
     planned = [one for part in args.only for one in trainings(part, args.budget, folder)]
     _require_budget(folder, args.budget)

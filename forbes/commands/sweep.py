@@ -13,7 +13,7 @@ from rich.table import Table
 
 from forbes.commands.console import console
 from forbes.commands.jobs import Launcher, run_jobs
-from forbes.commands.trainings import Training, failures, not_finished, require_trainable, training_job
+from forbes.commands.trainings import Training, failures, not_finished, require_trainable, unfinished_jobs
 from forbes.errors import ForbesError
 from forbes.files import replace_file
 from forbes.runs.checkpoint import read_checkpoint
@@ -61,8 +61,7 @@ def sweep(config: str, keys: Sequence[str], flags: Sequence[str], seeds: int, fo
         Training(config, (*flags, *point.flags), seed, runs[point.name][seed])
         for seed, point in itertools.product(range(seeds), points)
     ]
-    ended = run_jobs([training_job(training) for training in trainings], launcher)
-    failed = failures(ended)
+    failed = failures(run_jobs(unfinished_jobs(trainings), launcher))
     rows = [_row(point, [run for run in runs[point.name] if run not in failed]) for point in points]
     table = _ranked(pd.DataFrame([row for row in rows if row]))
     if len(table):
@@ -72,7 +71,7 @@ def sweep(config: str, keys: Sequence[str], flags: Sequence[str], seeds: int, fo
         print(f"best: {command_line('fit', config, *flags, *best.flags)}")
         print(f"sweep.csv is in {folder}")
     if failed:
-        raise not_finished(failed, len(ended))
+        raise not_finished(failed, len(trainings))
 
 
 def grid(config: str, keys: Sequence[str]) -> list[Point]:

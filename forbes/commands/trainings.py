@@ -16,7 +16,7 @@ from forbes.runs.folder import RunFolder, read_config
 from forbes.runs.provenance import read_provenance
 
 __all__ = ["Training", "complete_configuration", "failures", "forbes_command", "is_finished", "not_finished"]
-__all__ += ["require_trainable", "training_job"]
+__all__ += ["require_trainable", "training_job", "unfinished_jobs"]
 
 _SEEDS = ("seed_everything", "model.init_args.seed", "data.init_args.seed")  # the first is linked to the others
 
@@ -52,6 +52,11 @@ def training_job(training: Training, hours: float = 1.0) -> Job:
     arguments = ["--config", config, *flags, "--seed_everything", str(seed), "--run_dir", folder]
     resume = forbes_command("fit", "--resume", folder)
     return Job(folder, forbes_command("fit", *arguments), hours, folder, resume, refused)
+
+
+def unfinished_jobs(trainings: Sequence[Training]) -> list[Job]:
+    """Return the jobs of the trainings that are not finished, and of those whose folder has another configuration."""
+    return [job for job in map(training_job, trainings) if job.refused or not is_finished(job.run)]
 
 
 def is_finished(folder: str) -> bool:
@@ -97,19 +102,39 @@ def forbes_command(*arguments: str) -> list[str]:
 def _require_same_configuration(training: Training) -> None:
     """Refuse a run that was trained with another configuration, e.g. with fewer updates.
 
-    Callbacks may differ, since they only observe. Keys that the run's version of this package did not have are ignored.
+    Our callbacks that only observe may differ. Keys that the run's version of this package did not have are ignored.
     """
     config, flags, seed, run = training
-    trained = _flat(read_config(RunFolder(run).config))
-    trained |= {key: str(Path(trained[key]).absolute()) for key in trained if key.endswith(".path") and trained[key]}
-    asked = _flat(yaml.safe_load(complete_configuration(config, *flags))) | {key: seed for key in _SEEDS}
-    asked |= {key: str(Path(asked[key]).absolute()) for key in asked if key.endswith(".path") and asked[key]}
+    trained = _comparable(read_config(RunFolder(run).config))
+    asked = _comparable(yaml.safe_load(complete_configuration(config, *flags))) | {key: seed for key in _SEEDS}
     for key in asked:
-        if key in trained and trained[key] != asked[key] and key != "trainer.callbacks":
+        if key in trained and trained[key] != asked[key]:
             raise ForbesError(
                 f"{run}: was trained with {key} = {trained[key]}, expected {asked[key]}. Use its configuration and "
                 "flags, or another folder, -o"
             )
+
+
+def _comparable(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return every value of a configuration by its dotted key, with absolute paths, without callbacks that observe."""
+    found = _flat(config)
+    callbacks = found.pop("trainer.callbacks", None) or []
+    listed = callbacks if isinstance(callbacks, list) else [callbacks]
+    acting = {name: one for one in listed if (name := one["class_path"].rpartition(".")[2]) not in _observing()}
+    found |= {"trainer.callbacks": sorted(acting)}
+    for name, one in acting.items():
+        found |= _flat(one.get("init_args") or {}, f"trainer.callbacks.{name}")
+    return found | {key: str(Path(found[key]).absolute()) for key in found if key.endswith(".path") and found[key]}
+
+
+@cache
+def _observing() -> frozenset[str]:
+    """Return the names of our callbacks that do not change a training."""
+    import forbes.callbacks as ours  # imports Lightning, which only a folder with runs needs
+    from forbes.callbacks.picture import FileCallback
+
+    kinds = [getattr(ours, name) for name in ours.__all__]
+    return frozenset(kind.__name__ for kind in kinds if issubclass(kind, FileCallback | ours.ParameterCount))
 
 
 def _flat(section: Any, name: str = "") -> dict[str, Any]:

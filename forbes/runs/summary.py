@@ -104,22 +104,28 @@ def _starts(path: Path) -> list[dict[str, Any]]:
 
 
 def _last_metrics(path: Path) -> dict[str, Any]:
-    """Return the last value of each metric at the end of the file; a line that is cut is left out."""
+    """Return the last value of each metric at the end of the file; a line that is cut is left out.
+
+    A start discards the values of later updates, as in `forbes.runs.folder.read_metrics`.
+    """
     if not path.is_file():
         return {}
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - _TAIL))
         lines = file.read().split(b"\n")
-    found: dict[str, Any] = {}
+    records: list[dict[str, Any]] = []
     for line in lines[:-1] if size <= _TAIL else lines[1:-1]:
         try:
             record = json.loads(line)
         except (ValueError, RecursionError):
             continue
-        if isinstance(record, dict):
-            found.update((name, value) for name, value in record.items() if is_number(value))
-    return found
+        if not isinstance(record, dict) or not is_number(record.get("update")):
+            continue
+        if record.get("start"):
+            records = [known for known in records if known["update"] <= record["update"]]
+        records.append(record)
+    return {name: value for record in records for name, value in record.items() if is_number(value)}
 
 
 def _state(run: RunFolder, last: dict[str, Any]) -> str:

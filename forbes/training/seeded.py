@@ -13,6 +13,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from forbes.data import SequenceBatch
 from forbes.distributed import WeightedMeans, num_ranks, rank
+from forbes.errors import ForbesError
 from forbes.models.world import Schedule
 from forbes.seeding import derive_seed
 from forbes.training.divergence import hold_unless_finite
@@ -71,7 +72,16 @@ class SeededModule(LightningModule, ABC):
         """Name the metric, without its split, that says how well the training goes."""
 
     def configure_optimizers(self) -> Any:
-        """Return Adam and its schedule. It is fused, since a step over many small tensors is bound by calls."""
+        """Return Adam and its schedule. It is fused, since a step over many small tensors is bound by calls.
+
+        Raises:
+            ForbesError: if the schedule is a cosine, and the training has no end at which the rate is 0.
+        """
+        if self.schedule == "cosine" and math.isinf(self.trainer.estimated_stepping_batches):
+            raise ForbesError(
+                f"{type(self).__name__}: its schedule is a cosine to 0 at the last update, which this training does not "
+                "have. Set trainer.max_epochs or trainer.max_steps"
+            )
         groups = [{"params": group.parameters, "lr": group.rate} for group in self.groups()]
         optimizer = Adam(groups, eps=self.adam_eps, fused=True)
         scheduler = LambdaLR(optimizer, self._rate)

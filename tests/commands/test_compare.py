@@ -16,12 +16,14 @@ from forbes.commands import compare as compare_command
 from forbes.commands import trainings
 from forbes.commands.cli import main
 from forbes.commands.jobs import Ended, run_jobs
+from forbes.commands.trainings import Training, training_job
 from forbes.evaluation.comparison import Comparison, Family, compare, markdown
 from forbes.evaluation.metrics import score_of
 from forbes.evaluation.record import read_arrays, read_record
 from forbes.figures.comparison import draw_differences, draw_per_step, draw_scores
 from forbes.files import locked
-from forbes.runs.folder import read_metrics
+from forbes.runs.configuration import allow_modules
+from forbes.runs.folder import RunFolder, read_metrics
 
 ELBO = "test/elbo[bernoulli,S=2]"
 ONE_EPOCH = ["--", "--trainer.max_epochs", "1"]
@@ -296,6 +298,39 @@ def test_a_run_that_was_trained_otherwise_is_refused_and_the_others_finish(confi
     assert f"not finished: {folder}/rssm-0 {reason}" in out
     assert f"1 of 2 trainings are not finished, for the reasons above: {folder}/rssm-0. Fix them" in error
     assert read_metrics(folder / "forbes-0").index.max() == 10
+
+
+def test_finished_trainings_are_not_begun_again(configs, compared, tmp_path, monkeypatch):
+    folder, begun = shutil.copytree(compared, tmp_path / "again"), []
+    monkeypatch.setattr(compare_command, "run_jobs", lambda jobs, launcher: begun.extend(jobs) or [])
+
+    assert main(["compare", *configs, "--seeds", "2", "-o", str(folder), *MEASURES, *ONE_EPOCH]) == 0
+
+    assert begun == []
+
+
+@pytest.mark.parametrize(
+    ("callbacks", "refused"),
+    [
+        ("[{class_path: Collect, init_args: {seed_episodes: 5}}, ReturnCurve]", ""),
+        ("[{class_path: Collect, init_args: {seed_episodes: 3}}]", "seed_episodes = 5, expected 3. Use its"),
+        ("[Collect, CudaGraph]", "expected ['Collect', 'CudaGraph']"),
+    ],
+    ids=["picture", "other episodes", "other updates"],
+)
+def test_a_run_with_other_callbacks_is_refused_if_they_change_the_training(callbacks, refused, tmp_path):
+    config = write_config(tmp_path)
+    config.write_text(config.read_text().partition("  callbacks:")[0])
+    run = RunFolder(tmp_path / "run")
+    run.checkpoint.parent.mkdir(parents=True)
+    run.checkpoint.touch()
+    allow_modules(["toy_environments"])
+    run.config.write_text(configuration_here(str(config), "--trainer.callbacks", "[{class_path: Collect, init_args: {seed_episodes: 5}}]"))
+
+    reason = training_job(Training(str(config), ("--trainer.callbacks", callbacks), 0, str(run))).refused
+
+    assert refused in reason
+    assert bool(refused) == bool(reason)
 
 
 def test_a_folder_that_another_process_holds_is_named_with_it(configs, tmp_path, monkeypatch, capsys):

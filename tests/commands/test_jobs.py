@@ -63,7 +63,7 @@ time.sleep(0.2)
 
 def test_the_threads_are_shared_out(capsys, monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(8), raising=False)
 
     run_jobs([python("one", "import os; print(os.environ['OMP_NUM_THREADS'])")], Local(3))
 
@@ -108,6 +108,7 @@ def test_the_time_left_is_the_work_left_at_the_pace_so_far(monkeypatch, capsys):
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     board = Board({"a": 1.0, "b": 1.0, "c": 2.0}, later=1.0)
     board.shown()
+    board.say("b", "epoch 1/10  update 10/100")
     board.say("b", "epoch 5/10  update 50/100")
     clock[0] = 10.0
 
@@ -115,6 +116,20 @@ def test_the_time_left_is_the_work_left_at_the_pace_so_far(monkeypatch, capsys):
 
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "1 of 3 jobs have ended, about 0:00:23 left"  # 10 s for 1.5 hours, and 3.5 are left
+
+
+def test_what_an_earlier_command_did_is_not_counted_in_the_pace(monkeypatch, capsys):
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    board = Board({"agent": 1.0, "done": 0.0}, later=0.0)
+    board.shown()
+    board.say("agent", "seed episode 5/5: return 1.0")
+    clock[0] = 60.0
+    board.say("agent", "epoch 16/20  update 160/200")  # resumed at 15
+
+    board.end("done", 0)
+
+    assert capsys.readouterr().out.splitlines()[-1] == "1 of 2 jobs have ended, about 0:04:00 left"
 
 
 def test_a_job_tells_how_it_ended_and_what_it_said_last():

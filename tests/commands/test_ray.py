@@ -25,7 +25,7 @@ ray = pytest.importorskip("ray")
 
 from ray.cluster_utils import Cluster  # noqa: E402
 
-from forbes.commands.launchers.ray import Ray  # noqa: E402
+from forbes.commands.launchers.ray import Ray, _content_of  # noqa: E402
 
 EPOCHS = ("--trainer.max_epochs", "12")
 
@@ -125,6 +125,15 @@ def test_episodes_that_were_brought_back_are_sent_to_the_next_node(cluster, tmp_
     stored, expected = (EpisodeStore(folder / "episodes") for folder in (run, straight))
     assert stored.files() == expected.files() == [*range(3, 7)]
     stored.verify(stored.files())
+
+
+def test_configurations_travel_and_data_do_not(tiny_config, strokes_file):
+    """A run records the path of its data, and is resumed and evaluated elsewhere."""
+    arguments = ["--config", str(tiny_config), "--data.source.path", str(strokes_file)]
+
+    assert _content_of(Job("one", ["-m", "forbes", "fit", *arguments])).named == {
+        str(tiny_config): tiny_config.read_bytes()
+    }
 
 
 def test_a_folder_that_another_process_holds_is_not_written_to(cluster, tiny_config, tmp_path):

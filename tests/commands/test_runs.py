@@ -162,6 +162,14 @@ def test_the_last_of_many_lines_count_and_a_cut_one_does_not(tmp_path, capsys):
     assert rows(capsys)["a"][3:6] == ["4,999", "elbo", "-4999.0"]
 
 
+def test_a_score_that_was_trained_again_since_is_not_shown(tmp_path, capsys):
+    lines = [{"update": 500, ELBO: -100.0}, {"update": 900, ELBO: -9000.0}, {"update": 500, "start": True}]
+
+    write(tmp_path / "runs" / "a", status=0, lines=[*lines, {"update": 510, "train/kl": 1.0}])
+
+    assert rows(capsys)["a"][3:6] == ["510", "elbo", "-100.0"]
+
+
 def test_a_real_run_is_listed_and_shown(tiny_run, tmp_path, capsys):
     shutil.copytree(tiny_run, tmp_path / "runs" / "tiny")
     assert main(["evaluate", "runs/tiny", "--sequences", "4", "--samples", "2", "--scores", "elbo"]) == 0

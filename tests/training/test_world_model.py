@@ -319,6 +319,13 @@ def test_each_update_has_the_learning_rate_of_the_schedule(options, rates):
         assert rate(trainer) == 0  # after the last update
 
 
+def test_a_cosine_needs_an_end():
+    endless = Trainer(accelerator="cpu", max_epochs=-1, logger=False, enable_checkpointing=False)
+
+    with pytest.raises(ForbesError, match=r"a cosine to 0 at the last update, which this training does not have\. Set"):
+        endless.fit(make_world_model(schedule="cosine"), Batches(1))
+
+
 def test_an_update_changes_every_parameter_sooner_or_later():
     model = make_world_model()
     before = {name: p.detach().clone() for name, p in model.named_parameters()}

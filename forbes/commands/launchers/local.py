@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from forbes.commands.jobs import Job
 from forbes.commands.launchers.process import end, follow, start
 
-__all__ = ["Local"]
+__all__ = ["Local", "num_cpus"]
 
 
 class Local:
@@ -22,7 +22,7 @@ class Local:
 
     def __init__(self, at_once: int) -> None:
         self.at_once = at_once
-        self._threads = max(1, (os.cpu_count() or 1) // at_once)
+        self._threads = max(1, num_cpus() // at_once)
         self._lock, self._stopping = threading.Lock(), False
         self._processes: list[subprocess.Popen[str]] = []
 
@@ -46,3 +46,8 @@ class Local:
             self._stopping = True
         for process in self._processes:
             threading.Thread(target=end, args=(process,)).start()
+
+
+def num_cpus() -> int:
+    """Return how many CPUs this process may use: those of a job of SLURM or a container, not of the whole machine."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

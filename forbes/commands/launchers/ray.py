@@ -4,6 +4,7 @@ Where a node does not see the output folder, it trains in a temporary copy of th
 the files that have changed are brought back. So a job continues on any node.
 """
 
+import itertools
 import os
 import queue
 import secrets
@@ -38,7 +39,7 @@ class _Content(NamedTuple):
     """Files that a node needs which does not see the output folder."""
 
     named: Mapping[str, bytes]
-    """Files that are named in the command, by their name there."""
+    """Configurations that are named in the command, by their name there."""
     run: Mapping[str, Any]
     """References of the files of the run folder, by their path in it."""
 
@@ -157,8 +158,12 @@ def _require_answer(address: str) -> None:
 
 
 def _content_of(job: Job) -> _Content:
-    """Put the files that a job needs into the cluster, one at a time, since an agent's episodes take gigabytes."""
-    named = {word: Path(word).read_bytes() for word in job.command if Path(word).is_file()}
+    """Put the files that a job needs into the cluster, one at a time, since an agent's episodes take gigabytes.
+
+    Data are not among them: a run records where they are, and is resumed and evaluated elsewhere.
+    """
+    configs = [word for flag, word in itertools.pairwise(job.command) if flag == "--config" and Path(word).is_file()]
+    named = {config: Path(config).read_bytes() for config in configs}
     stored = stamps(job.run) if job.run else {}
     return _Content(named, {name: ray.put(Path(job.run, name).read_bytes()) for name in stored})
 
