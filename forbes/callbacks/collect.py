@@ -80,7 +80,8 @@ class Collect(Callback):
         require_agent(self, trainer, pl_module)
         self._estimated = False
         if stage == "fit":
-            source, folder = _experience(trainer), Path(trainer.strategy.broadcast(trainer.default_root_dir)) / "episodes"
+            source = _experience(trainer)
+            folder = Path(trainer.strategy.broadcast(trainer.default_root_dir)) / "episodes"
             if trainer.is_global_zero:
                 source.open(folder)
             else:

@@ -139,8 +139,8 @@ def require_metrics(callback: Callback, trainer: Trainer) -> None:
     """Raise a ForbesError if the training does not write the `metrics.jsonl` that the callback draws."""
     if not trainer.fast_dev_run and not any(isinstance(logger, JsonLinesLogger) for logger in trainer.loggers):
         raise ForbesError(
-            f"{type(callback).__name__}: draws metrics.jsonl, which this training does not write. Remove this callback, "
-            "or keep the logger of `forbes fit`"
+            f"{type(callback).__name__}: draws metrics.jsonl, which this training does not write. Remove this "
+            "callback, or keep the logger of `forbes fit`"
         )
 
 

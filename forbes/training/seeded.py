@@ -79,8 +79,8 @@ class SeededModule(LightningModule, ABC):
         """
         if self.schedule == "cosine" and math.isinf(self.trainer.estimated_stepping_batches):
             raise ForbesError(
-                f"{type(self).__name__}: its schedule is a cosine to 0 at the last update, which this training does not "
-                "have. Set trainer.max_epochs or trainer.max_steps"
+                f"{type(self).__name__}: its schedule is a cosine to 0 at the last update, which this training does "
+                "not have. Set trainer.max_epochs or trainer.max_steps"
             )
         groups = [{"params": group.parameters, "lr": group.rate} for group in self.groups()]
         optimizer = Adam(groups, eps=self.adam_eps, fused=True)

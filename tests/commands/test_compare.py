@@ -325,7 +325,8 @@ def test_a_run_with_other_callbacks_is_refused_if_they_change_the_training(callb
     run.checkpoint.parent.mkdir(parents=True)
     run.checkpoint.touch()
     allow_modules(["toy_environments"])
-    run.config.write_text(configuration_here(str(config), "--trainer.callbacks", "[{class_path: Collect, init_args: {seed_episodes: 5}}]"))
+    trained = "[{class_path: Collect, init_args: {seed_episodes: 5}}]"
+    run.config.write_text(configuration_here(str(config), "--trainer.callbacks", trained))
 
     reason = training_job(Training(str(config), ("--trainer.callbacks", callbacks), 0, str(run))).refused
 
