@@ -11,11 +11,12 @@ from rich.table import Table
 
 from forbes.commands.console import console
 from forbes.commands.parsers.calibrate import parser
+from forbes.errors import ForbesError
 from forbes.evaluation.adapters import load_all
 from forbes.evaluation.calibration.ranks import coverage
 from forbes.evaluation.calibration.runs import calibrate_run
 from forbes.evaluation.calibration.self_calibration import SelfCalibration
-from forbes.evaluation.calibration.uniformity import kolmogorov_smirnov, pearson, spread
+from forbes.evaluation.calibration.uniformity import BINS, kolmogorov_smirnov, pearson, spread
 from forbes.evaluation.runs import TrainedRun, run_titles
 from forbes.figures.calibration import RankedBelief, calibration
 from forbes.figures.style import method_styles, save_png_and_pdf
@@ -41,6 +42,11 @@ class _Tests(NamedTuple):
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
+    for name, least in (("samples", BINS - 1), ("sequences", 5 * BINS)):
+        if getattr(args, name) < least:
+            raise ForbesError(
+                f"--{name} {getattr(args, name)}: expected at least {least}, for a test of ranks in {BINS} bins"
+            )
     runs = load_all(args.runs, args.model, args.data, needs=("sample",))
     found = [calibrate_run(run, args.sequences, args.time, args.samples, args.seed, args.particles) for run in runs]
     tests = [_tests(one, args.samples) for one in found]

@@ -1,6 +1,7 @@
 """`forbes rollout`: record episodes of an agent as a video."""
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -9,14 +10,14 @@ from torch import Tensor
 
 from forbes.commands.parsers.rollout import parser
 from forbes.data.episodes.episode import Episode
-from forbes.envs import EnvironmentProcess
+from forbes.envs import Environment, EnvironmentProcess
 from forbes.errors import ForbesError
 from forbes.evaluation.agents import play_test_episode, seed_of_test_episode
 from forbes.evaluation.films import camera_of, film
 from forbes.evaluation.runs import find_device
 from forbes.figures.dreams import curves, dream
 from forbes.figures.grids import is_image, require_images
-from forbes.figures.video import FORMATS, captioned, enlarged, side_by_side, tiled
+from forbes.figures.video import FORMATS, captioned, enlarged, require_format, side_by_side, tiled
 from forbes.files import replace_file
 from forbes.models import Likelihood, PartsLikelihood
 from forbes.shapes import map_parts
@@ -29,12 +30,11 @@ __all__ = ["main"]
 def main(argv: Sequence[str]) -> None:
     """Run the command with its arguments."""
     args = parser().parse_args(argv)
-    if args.video.suffix not in FORMATS:
-        found, expected = args.video.suffix or "nothing", " or ".join(FORMATS)
-        raise ForbesError(f"--video {args.video}: it ends in {found}, expected {expected}. Rename it")
+    require_format(args.video)
     videos = []
     with loaded_agent(args.run, find_device(args.device), args.acting_samples) as (agent, environment, _):
-        if camera_of(environment.make) is None and not args.imagine:
+        make = _camera(environment)
+        if make is None and not args.imagine:
             remedy = "Add --imagine 15 to draw them as curves; for the return alone, run: forbes evaluate " + args.run
             require_images(args.run, environment.observation_shape, remedy)
         for number in range(args.episodes):
@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> None:
             steps = f"{len(episode.reward) - 1:,} agent steps, {episode.frames:,} env steps"
             print(f"episode {number + 1}: return {episode.total_reward:.2f}, {steps}", flush=True)
             seed = seed_of_test_episode(args.seed, number)
-            shown = _pictures(agent, environment, episode, seed)
+            shown = _pictures(agent, environment, make, episode, seed)
             if args.imagine:
                 shown = _beside(agent, episode, shown, args.imagine, seed)
             assert shown is not None  # of observations that are no images, and without a camera
@@ -51,13 +51,29 @@ def main(argv: Sequence[str]) -> None:
     print(args.video)
 
 
+def _camera(environment: EnvironmentProcess) -> Callable[[], Environment] | None:
+    """Return a function that makes the environment with a camera; None if it is not needed, or there is none."""
+    if is_image(environment.observation_shape) or (make := camera_of(environment.make)) is None:
+        return None
+    try:
+        EnvironmentProcess(make).close()
+    except ForbesError as error:
+        print(f"no camera: {error}", file=sys.stderr)
+        return None
+    return make
+
+
 def _pictures(
-    agent: WorldModelAgent, environment: EnvironmentProcess, episode: Episode, seed: int
+    agent: WorldModelAgent,
+    environment: EnvironmentProcess,
+    make: Callable[[], Environment] | None,
+    episode: Episode,
+    seed: int,
 ) -> NDArray[np.uint8] | None:
     """Return the observed images of an episode, or those of a camera, `(T + 1, C, H, W)`; None if there is none."""
     if is_image(environment.observation_shape):
         return _to_bytes(agent.model.likelihood.images(_seen(agent, episode)))
-    if (make := camera_of(environment.make)) is None:
+    if make is None:
         return None
     with EnvironmentProcess(make, time_limit=len(episode.action) - 1) as camera:
         return film(camera, episode, seed)

@@ -25,6 +25,7 @@ from forbes.seeding import generator
 
 __all__ = ["main"]
 
+_TIE = 1e-9  # nats
 _FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _MAX_SAMPLES = 30_000_000  # samples times steps; they take 1 GB
 
@@ -39,7 +40,7 @@ _SCAN = """\
 Between the exact filter and the best q(s_t|o_1:t), the ELBO and the prequential score rank the beliefs in opposite \
 orders."""
 
-_EXACT = "With F = 0, or one step, all four beliefs are the exact one, so the tables have no differences."
+_EXACT = "The four beliefs have the same ELBO up to 1e-9 nats, as with F = 0 or one step, so there is nothing to rank."
 
 
 def main(argv: Sequence[str]) -> None:
@@ -51,7 +52,7 @@ def main(argv: Sequence[str]) -> None:
     processes = _processes(args)
     screen = console(80)
     table, apart = _identity(processes, args.samples, args.seed)
-    if all(process.transition == 0 or process.steps == 1 for process in processes):
+    if all(_same_bounds(process) for process in processes):
         screen.print(table, _beliefs(processes), _scan(processes), _EXACT, sep="\n", highlight=False)
         return
     screen.print(table, _IDENTITY.format(apart=apart), "", sep="\n", highlight=False)
@@ -66,6 +67,12 @@ def _processes(args: argparse.Namespace) -> list[ClosedFormProcess]:
         return [process._replace(steps=args.steps) for process in PROCESSES]
     transition, process_noise, observation_noise = (1.0 if value is None else value for value in given)
     return [ClosedFormProcess(transition, process_noise, observation_noise, args.steps)]
+
+
+def _same_bounds(process: ClosedFormProcess) -> bool:
+    """Return whether the posteriors have the same ELBO, up to `_TIE`."""
+    gaps = [belief_scores(process, posterior_of(process)).elbo_gap for posterior_of in POSTERIORS.values()]
+    return max(gaps) - min(gaps) < _TIE
 
 
 def _name(process: ClosedFormProcess) -> str:
@@ -143,5 +150,5 @@ def _scan(processes: Sequence[ClosedFormProcess]) -> Table:
 
 
 def _rank(value: float, values: Sequence[float]) -> str:
-    """Return the rank of a value, from 1; differences below 1e-9 are ties."""
-    return str(1 + sum(other < value - 1e-9 for other in values))
+    """Return the rank of a value, from 1; differences below `_TIE` are ties."""
+    return str(1 + sum(other < value - _TIE for other in values))

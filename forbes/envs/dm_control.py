@@ -19,7 +19,13 @@ from forbes.envs.views import VELOCITIES
 from forbes.errors import ForbesError, require_at_least
 from forbes.shapes import Observed
 
-__all__ = ["DeepMindControl", "environment_variable", "measure"]
+__all__ = ["DOMAINS", "DeepMindControl", "environment_variable", "measure"]
+
+DOMAINS = (
+    *("acrobot", "ball_in_cup", "cartpole", "cheetah", "dog", "finger", "fish", "hopper", "humanoid", "humanoid_CMU"),
+    *("lqr", "manipulator", "pendulum", "point_mass", "quadruped", "reacher", "stacker", "swimmer", "walker"),
+)
+"""Domains of the suite, with which the names of its tasks begin."""
 
 _NO_RENDERING = "disable"
 """Value of MUJOCO_GL for which dm_control loads no backend."""

@@ -46,8 +46,8 @@ class Gymnasium(Environment):
         parts: entries of a Dict observation to use, each as a part of its own.
 
     Raises:
-        ForbesError: for an unknown id, an unsupported space of actions or observations, or if gymnasium is not
-            installed.
+        ForbesError: for an unknown id, an unsupported space of actions or observations, a size without images, or if
+            gymnasium is not installed.
 
     Example:
         >>> environment = forbes.Gymnasium("CartPole-v1")
@@ -82,6 +82,8 @@ class Gymnasium(Environment):
             self._seen = _entries(task, self._space, part, parts)
             for space in self._seen.values() or [self._space]:
                 self._spaces.require_observations(task, space)
+            if size is not None and not any(map(self._spaces.is_image, self._seen.values() or [self._space])):
+                raise ForbesError(f"{task}: size is for images, and it observes none. Set pixels, or leave size out")
         self._single = parts is None and len(self._seen) == 1
         self._actions: Any = self._environment.action_space
         self._spaces.require_actions(task, self._actions)
@@ -162,6 +164,8 @@ def _make(task: str, pixels: bool) -> Any:
         raise ForbesError(f"{task}: {error}") from error
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         name = task.rpartition(":")[2]
+        if name in gymnasium.registry and isinstance(error, ModuleNotFoundError):
+            raise ForbesError(f"{task}: needs the module {error.name}, which is not installed. Install it") from error
         near = difflib.get_close_matches(name, gymnasium.registry, n=3)
         hint = f". Did you mean {' or '.join(near)}?" if near else f" ({error}). Use a registered id"
         raise ForbesError(f"{task}: gymnasium has no such environment{hint}") from error

@@ -10,6 +10,7 @@ Of an observation of several parts, a view changes all parts, or those that its 
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -228,7 +229,7 @@ class Delay(View):
         """Return o_{t-k}."""
         if self._steps == 0:
             self._late.extend([_blank(observation)] * self.value)
-        self._late.append(observation)
+        self._late.append(map_parts(np.copy, observation))  # it may be a buffer of the environment
         return self._late[0]
 
 
@@ -259,6 +260,13 @@ VIEWS: dict[str, Callable[[Environment, Any], View]] = {
     kind.option: kind for kind in (Hide, Flicker, Occlude, Noise, Delay, BlankUntil)
 }
 """Views by their name in the options of a task."""
+
+
+def without_views(make: Callable[..., Environment]) -> Callable[..., Environment]:
+    """Return the function that makes an environment without its views."""
+    while isinstance(make, partial) and make.func is look_through:
+        make = make.args[0]
+    return make
 
 
 def look_through(make: Callable[[], Environment], views: dict[str, Any]) -> Environment:

@@ -5,6 +5,7 @@ unless the environment does.
 """
 
 import atexit
+import inspect
 import io
 import os
 import pickle
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from forbes.child import start_child
 from forbes.envs.base import TIME_LIMIT, Environment, Step, check_environment, check_step
+from forbes.envs.views import without_views
 from forbes.errors import ForbesError
 from forbes.factors import Discrete
 from forbes.shapes import Shape, shape_of
@@ -118,9 +120,12 @@ class EnvironmentProcess(Environment):
 
     @property
     def _name(self) -> str:
-        """Name for error messages: the task, or before it is built, the name of `make`."""
-        built = hasattr(self, "_description")
-        return str(self._description["task"] if built else getattr(self.make, "func", self.make).__name__)
+        """Name for error messages: the task, or of a class without an argument of this name, the class."""
+        if hasattr(self, "_description"):
+            return str(self._description["task"])
+        make = without_views(self.make)
+        kind, arguments = getattr(make, "func", make), getattr(make, "args", ())
+        return str(arguments[0]) if arguments and "task" in inspect.signature(kind).parameters else str(kind.__name__)
 
     def _start(self) -> None:
         self._process, self._connection = start_child(_serve, self.make)

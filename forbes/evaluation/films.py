@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from forbes.data.episodes.collection import play
 from forbes.data.episodes.episode import Episode
 from forbes.envs import Environment, EnvironmentProcess
-from forbes.envs.views import look_through
+from forbes.envs.views import without_views
 from forbes.errors import ForbesError
 
 __all__ = ["camera_of", "film"]
@@ -20,8 +20,7 @@ _SIDE = 256  # pixels
 
 def camera_of(make: Callable[..., Environment]) -> Callable[[], Environment] | None:
     """Return a function that makes the same environment without views and with `pixels`, or None if it has none."""
-    while isinstance(make, partial) and make.func is look_through:
-        make = make.args[0]
+    make = without_views(make)
     options = inspect.signature(make).parameters
     if "pixels" not in options:
         return None

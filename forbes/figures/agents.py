@@ -15,10 +15,12 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from forbes.envs.dm_control import DOMAINS
 from forbes.errors import ForbesError
 from forbes.evaluation.methods import LAYERS, TRAJECTORIES, RecordedRun, group_by_method, read_run, returns_of
 from forbes.evaluation.published import published_curves, published_returns
 from forbes.evaluation.returns import Summary, summarise
+from forbes.evaluation.runs import require_distinct
 from forbes.figures.returns import join_seeds
 from forbes.figures.style import (
     BLACK,
@@ -117,12 +119,12 @@ def _is_papers(run: RecordedRun) -> bool:
 
 
 def _with_fewest_layers(runs: Sequence[str]) -> list[RecordedRun]:
-    """Return the runs without those of the ablation of layers: of each method those with the fewest."""
+    """Return the runs without those of the ablation of layers: of each method those with the fewest on a task."""
     recorded = [read_run(path) for path in runs]
-    layers: dict[str, list[int]] = {}
+    layers: dict[tuple[str, str], list[int]] = {}
     for run in recorded:
-        layers.setdefault(run.method, []).append(run.settings.get(LAYERS, 0))
-    return [run for run in recorded if run.settings.get(LAYERS, 0) == min(layers[run.method])]
+        layers.setdefault((run.task, run.method), []).append(run.settings.get(LAYERS, 0))
+    return [run for run in recorded if run.settings.get(LAYERS, 0) == min(layers[run.task, run.method])]
 
 
 def _read(runs: Sequence[RecordedRun], limit: int, always: Collection[str] = ()) -> dict[str, dict[str, AgentCurves]]:
@@ -143,7 +145,7 @@ def _read(runs: Sequence[RecordedRun], limit: int, always: Collection[str] = ())
 
 def _is_control(task: str) -> bool:
     """Return whether a task is one of DeepMind Control, whose returns are at most 1,000."""
-    return len(published_returns(task)) > 0
+    return task.startswith(tuple(f"{domain}_" for domain in DOMAINS))
 
 
 def summarise_returns(runs: Sequence[str], limit: int = _LIMIT) -> dict[str, Summary]:
@@ -153,8 +155,9 @@ def summarise_returns(runs: Sequence[str], limit: int = _LIMIT) -> dict[str, Sum
     task that not all methods have is left out. The key of each summary is its title.
 
     Raises:
-        ForbesError: if a run has no measured returns, or the seeds of a method have no step in common.
+        ForbesError: if a run is named twice or has no measured returns, or the seeds of a method have no common step.
     """
+    require_distinct(runs)
     return _summaries(_read([read_run(path) for path in runs], limit))
 
 

@@ -99,6 +99,9 @@ def draw(name: str, runs: Sequence[str], folder: Path, **options: Any) -> list[P
             raise ForbesError(
                 f"--{option}: is an option of {' and '.join(having) or 'no figure'}, not of {figure.name}. Leave it out"
             )
+    from forbes.evaluation.runs import require_distinct  # imports torch
+
+    require_distinct(runs)
     figures = _load(figure.target)(runs, **options)
     save = _load("style:save_png_and_pdf")
     return [path for file, picture in figures.items() for path in save(picture, folder, file)]

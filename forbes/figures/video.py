@@ -2,6 +2,8 @@
 
 import io
 from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +13,7 @@ from forbes.errors import ForbesError
 from forbes.figures.episodes import to_rgb
 from forbes.rounding import ceil_div
 
-__all__ = ["FORMATS", "captioned", "enlarged", "gif", "mp4", "side_by_side", "tiled"]
+__all__ = ["FORMATS", "captioned", "enlarged", "gif", "mp4", "require_format", "side_by_side", "tiled"]
 
 _FRAME, _LAST_FRAME = 40, 1000
 """Duration of a frame and of the last frame of an episode, in milliseconds."""
@@ -47,14 +49,9 @@ def mp4(episodes: Sequence[NDArray[np.uint8]]) -> bytes:
 
     Args:
         episodes: frames of each episode, as for `gif`.
-
-    Raises:
-        ForbesError: if PyAV is not installed.
     """
-    try:
-        import av
-    except ModuleNotFoundError as error:
-        raise ForbesError("an MP4 needs PyAV. pip install 'forbes[video]', or write a .gif") from error
+    import av  # an extra of this package
+
     content = io.BytesIO()
     with av.open(content, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=1000 // _FRAME, options={"crf": "18"})
@@ -71,6 +68,15 @@ def mp4(episodes: Sequence[NDArray[np.uint8]]) -> bytes:
 
 FORMATS: dict[str, Callable[[Sequence[NDArray[np.uint8]]], bytes]] = {".gif": gif, ".mp4": mp4}
 """Functions that write a video, by the ending of its file."""
+
+
+def require_format(path: Path) -> None:
+    """Raise a ForbesError unless a video of this name can be written."""
+    if path.suffix not in FORMATS:
+        found, expected = path.suffix or "nothing", " or ".join(FORMATS)
+        raise ForbesError(f"--video {path}: it ends in {found}, expected {expected}. Rename it")
+    if path.suffix == ".mp4" and find_spec("av") is None:
+        raise ForbesError(f"--video {path}: an MP4 needs PyAV. pip install 'forbes[video]', or write a .gif")
 
 
 def _with_pauses(episodes: Sequence[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:

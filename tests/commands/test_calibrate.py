@@ -48,7 +48,8 @@ def test_it_prints_the_coverage_and_draws_the_ranks(run, tmp_path, capsys):
     [
         (["--time", "16"], "have 15 steps"),
         (["--sequences", "10001"], "was trained on 10000 sequences"),
-        (["--samples", "5", "--sequences", "60"], "Choose fewer bins"),
+        (["--samples", "8"], "--samples 8: expected at least 9, for a test of ranks in 10 bins"),
+        (["--sequences", "49"], "--sequences 49: expected at least 50, for a test of ranks in 10 bins"),
     ],
 )
 def test_what_cannot_be_checked_is_said_in_one_sentence(run, tmp_path, capsys, flags, expected):

@@ -11,8 +11,9 @@ from small_agents import fit, forbes, write_config, write_image_config
 from toy_environments import Parrot
 
 from forbes import GaussianBelief, MLPDecoder, MLPEncoder, VectorNormal, WorldModel
+from forbes.commands.rollout import _camera
 from forbes.data.episodes.collection import play, random_policy
-from forbes.envs import Environment, Step
+from forbes.envs import Environment, EnvironmentProcess, Step, find_environment
 from forbes.envs.views import look_through
 from forbes.errors import ForbesError
 from forbes.evaluation.agents import play_test_episode
@@ -184,6 +185,16 @@ def test_every_imagined_step_is_drawn():
         orange.append(int(((frame[0] > 180) & (frame[2] < 120)).sum()))
 
     assert orange[0] > 0.3 * orange[1] > 0
+
+
+def test_an_environment_that_does_not_render_is_drawn_as_curves(capsys):
+    """Every environment of Gymnasium has the option `pixels`."""
+    make = find_environment("gymnasium:popgym:popgym-RepeatPreviousEasy-v0")
+
+    with EnvironmentProcess(make) as environment:
+        assert _camera(environment) is None
+
+    assert "no camera: popgym:popgym-RepeatPreviousEasy-v0: it does not render images" in capsys.readouterr().err
 
 
 def test_an_agent_of_vectors_is_drawn_as_curves(tmp_path):

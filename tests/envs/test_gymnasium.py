@@ -70,6 +70,7 @@ def needs_another_package(render_mode=None):
 @pytest.fixture(scope="module", autouse=True)
 def registered():
     gymnasium.register("forbes/Needy-v0", entry_point=needs_another_package)
+    gymnasium.register("forbes/Bare-v0", entry_point="no_such_module:Bare")
     gymnasium.register("forbes/Camera-v0", entry_point=Camera)
     gymnasium.register("forbes/Levers-v0", entry_point=Levers)
     gymnasium.register("forbes/Given-v0", entry_point=toy_gymnasium.Given, disable_env_checker=True)
@@ -138,9 +139,15 @@ def test_an_image_has_a_pixel_at_least(pixels):
         Gymnasium("forbes/Camera-v0", pixels=pixels, size=0)
 
 
+def test_a_size_without_an_image_is_refused():
+    with pytest.raises(ForbesError, match=r"CartPole-v1: size is for images, and it observes none\. Set pixels"):
+        Gymnasium("CartPole-v1", size=64)
+
+
 @pytest.mark.parametrize(
     ("task", "sentence"),
     [
+        ("forbes/Bare-v0", "forbes/Bare-v0: needs the module no_such_module, which is not installed. Install it"),
         ("Pendulm-v1", "Pendulm-v1: gymnasium has no such environment. Did you mean Pendulum-v1"),
         ("toy_gymnasium:Toy-Room-v0", "gymnasium has no such environment. Did you mean Toy-Rooms-v0"),
         ("no_such_package:Thing-v0", "no_such_package:Thing-v0: gymnasium has no such environment"),

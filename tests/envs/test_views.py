@@ -136,6 +136,23 @@ def test_delay_shows_what_was_seen_k_steps_before(make, steps):
     assert not late[:steps].any()
 
 
+class OneBuffer(Parrot):
+    """Writes each observation into the same array."""
+
+    def reset(self, seed):
+        self.buffer = super().reset(seed).observation.copy()
+        return Step(self.buffer)
+
+    def step(self, action):
+        step = super().step(action)
+        self.buffer[:] = step.observation
+        return step._replace(observation=self.buffer)
+
+
+def test_what_is_delayed_does_not_change_meanwhile():
+    np.testing.assert_array_equal(observations(Delay(OneBuffer(), 2)), observations(Delay(Parrot(), 2)))
+
+
 @pytest.mark.parametrize("steps", [0, 3, 100])
 def test_blank_until_shows_nothing_and_then_all(steps):
     true, shown = observations(Parrot()), observations(BlankUntil(Parrot(), steps))

@@ -266,6 +266,14 @@ def test_a_script_on_standard_input_is_told_to_move_to_a_file():
     )
 
 
+@pytest.mark.parametrize("task", ["tiger", "cartpole_balance"])
+def test_an_environment_that_does_not_start_is_named_by_its_task(task, monkeypatch):
+    monkeypatch.setattr(worker, "START_LIMIT", 0.01)
+
+    with pytest.raises(BrokenEnvironmentError, match=rf"^{task}: it hangs, no answer to start"):
+        EnvironmentProcess(find_environment(task, noise=0.1))
+
+
 def test_what_cannot_be_sent_to_another_process_is_one_sentence():
     class Local(Echo):
         pass

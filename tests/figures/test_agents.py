@@ -2,15 +2,18 @@
 
 import gzip
 import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
+from dm_control import suite
 from matplotlib.colors import to_hex
 from recorded_runs import write_agent, write_run
 from small_agents import fit, write_config
 
 from forbes.commands.cli import main
+from forbes.envs.dm_control import DOMAINS
 from forbes.errors import ForbesError
 from forbes.figures.agents import (
     PAPER_TASKS,
@@ -22,6 +25,7 @@ from forbes.figures.agents import (
     summarise_returns,
     variant_styles,
 )
+from forbes.figures.catalogue import draw
 from forbes.figures.returns import join_seeds
 from forbes.figures.style import METHODS
 
@@ -198,8 +202,36 @@ def test_methods_may_have_different_numbers_of_layers(tmp_path):
     """Only a method's own deeper variants belong to the ablation of layers."""
     flat = write_agent(tmp_path / "flat", "hop", {10: 1}, "GaussianBelief", 1, layers=1)
     deep = write_agent(tmp_path / "deep", "hop", {10: 2}, "FlowBelief", 4, layers=2)
+    elsewhere = [
+        write_agent(tmp_path / "one", "swim", {10: 1}, "GaussianBelief", 1, layers=3),
+        write_agent(tmp_path / "four", "swim", {10: 2}, "GaussianBelief", 4, layers=3),
+    ]
 
-    assert legend(draw_trajectories([flat, deep])["trajectories"]) == ["Dreamer, N = 1", "FORBES, N = 4"]
+    figure = only(draw_trajectories([flat, deep, *elsewhere]), "trajectories")
+
+    assert {name: len(axes.lines) for name, axes in panels(figure).items()} == {"hop": 2, "swim": 2}
+
+
+def test_a_run_is_not_two_seeds(agents, tmp_path):
+    twice = [agents["planet"], f"{agents['planet']}/"]
+
+    for summarise in (partial(draw, "returns", folder=tmp_path), summarise_returns):
+        with pytest.raises(ForbesError, match=r"is named twice\. Name each run once"):
+            summarise(runs=twice)
+
+
+def test_every_task_of_the_suite_has_its_scale(tmp_path):
+    """Those without published returns, too."""
+    runs = [
+        write_agent(tmp_path / f"{task}-{belief}", task, {10: 1, 600_000: 2}, belief)
+        for task in ("humanoid_walk", "walker_walk", "hop")
+        for belief in ("FlowBelief", "GaussianBelief")
+    ]
+
+    assert {*DOMAINS} == {domain for domain, _ in suite.ALL_TASKS}
+    control, other = summarise_returns(runs)
+    assert "(humanoid_walk at 10, walker_walk at 10 env steps)" in control
+    assert "(hop at 600,000 env steps)" in other
 
 
 def test_the_first_variant_of_a_method_is_drawn_like_the_method():

@@ -1,11 +1,14 @@
 """Videos: frames next to each other in a grid, and files that play."""
 
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from forbes.figures.video import captioned, enlarged, mp4, side_by_side, tiled
+from forbes.errors import ForbesError
+from forbes.figures import video
+from forbes.figures.video import captioned, enlarged, mp4, require_format, side_by_side, tiled
 
 
 def episode(length, colour, side=8):
@@ -38,6 +41,14 @@ def test_side_by_side_and_captions_keep_the_frames():
     np.testing.assert_array_equal(both[:2, :, :, 16:24], other)
     np.testing.assert_array_equal(named[:, :, 14:], one)
     assert (named[:, :, :14] < 255).any()  # text
+
+
+def test_an_mp4_without_pyav_is_refused(monkeypatch):
+    monkeypatch.setattr(video, "find_spec", lambda name: None)
+    require_format(Path("agent.gif"))
+
+    with pytest.raises(ForbesError, match=r"--video agent.mp4: an MP4 needs PyAV. pip install 'forbes\[video\]'"):
+        require_format(Path("agent.mp4"))
 
 
 @pytest.mark.parametrize("shape", [(3, 8, 8), (1, 9, 15)])

@@ -12,10 +12,13 @@ from torch import Tensor
 
 from forbes.errors import ForbesError
 
-__all__ = ["binomial_interval", "ecdf_band", "kolmogorov_smirnov", "pearson", "spread"]
+__all__ = ["BINS", "binomial_interval", "ecdf_band", "kolmogorov_smirnov", "pearson", "spread"]
+
+BINS = 10
+"""Default number of bins of ranks."""
 
 
-def pearson(ranks: Tensor, samples: int, bins: int = 10) -> Tensor:
+def pearson(ranks: Tensor, samples: int, bins: int = BINS) -> Tensor:
     r"""Return the p-value of Pearson's :math:`\chi^2` test over nearly equal bins.
 
     .. math:: \chi^2 = \sum_b (n_b - N p_b)^2 / (N p_b), \qquad p_b = \text{ranks in bin } b \,/\, (L + 1)
