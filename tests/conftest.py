@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import small_agents
 import torch
 from small_strokes import write_config, write_strokes
 
@@ -64,6 +65,61 @@ def tiny_run(tiny_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     run = tmp_path_factory.mktemp("runs") / "tiny"
     assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run)]) == 0
     return run
+
+
+VARIANTS = {
+    "rssm": ("--model.belief", "GaussianBelief"),
+    "vector": ("--model.model", "VectorModel", "--model.state_dim", "0"),
+    "particle": ("--model.belief", "GaussianBelief", "--model.model", "ParticleModel", "--model.model.particles", "2"),
+    "forbes1": ("--seed_everything", "1"),
+}
+
+
+def fit_variant(name: str, config: Path, folder: Path) -> Path:
+    assert main(["fit", "--config", str(config), "--run_dir", str(folder / name), *VARIANTS[name]]) == 0
+    return folder / name
+
+
+@pytest.fixture(scope="session")
+def tiny_rssm(tiny_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of an RSSM on the same digits; not to be changed."""
+    return fit_variant("rssm", tiny_config, tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="session")
+def tiny_vector(tiny_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of a model without a state on the same digits; not to be changed."""
+    return fit_variant("vector", tiny_config, tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="session")
+def tiny_particle(tiny_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of a particle filter on the same digits; not to be changed."""
+    return fit_variant("particle", tiny_config, tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="session")
+def tiny_forbes1(tiny_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second seed of the tiny run; not to be changed."""
+    return fit_variant("forbes1", tiny_config, tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="session")
+def small_agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of an agent that sees vectors, of one epoch; not to be changed."""
+    folder = tmp_path_factory.mktemp("agent")
+    config = small_agents.write_config(folder)
+    assert small_agents.fit("--config", config, "--trainer.max_epochs", 1, "--run_dir", folder / "forbes-0") == 0
+    return folder / "forbes-0"
+
+
+@pytest.fixture(scope="session")
+def small_image_agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of an agent that sees images, of one epoch; not to be changed."""
+    folder = tmp_path_factory.mktemp("agent")
+    config = small_agents.write_image_config(folder)
+    assert small_agents.fit("--config", config, "--trainer.max_epochs", 1, "--run_dir", folder / "forbes-0") == 0
+    return folder / "forbes-0"
 
 
 @pytest.fixture

@@ -3,10 +3,9 @@
 import contextlib
 import io
 
-import pytest
-
 from forbes.commands.cli import main
 from forbes.commands.jobs import Ended
+from forbes.errors import ForbesError
 
 __all__ = ["configuration_here", "run_here"]
 
@@ -24,6 +23,11 @@ def run_here(jobs, launcher, later=0.0, on_end=lambda ended: None):
 
 def configuration_here(config, *flags):
     """Stand in for the process that prints a configuration."""
-    with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit, match="0"):
-        main(["fit", "--config", config, *flags, "--print_config"])
+    with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.redirect_stderr(io.StringIO()) as told:
+        try:
+            status = main(["fit", "--config", config, *flags, "--print_config"])
+        except SystemExit as done:
+            status = done.code
+    if status != 0:
+        raise ForbesError(told.getvalue().splitlines()[-1].removeprefix("forbes: "))
     return printed.getvalue()

@@ -29,15 +29,6 @@ PACKAGES += ["figures", "callbacks", "commands"]
 LINE = [*FOUNDATION, *PACKAGES, "__main__", "__init__"]
 
 
-def imports_of(path):
-    """Return the full names that a module imports, anywhere in it."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-
-
 def part_of(name):
     """Return the package, or the single module, that a full name belongs to."""
     return name.split(".")[1]
@@ -47,36 +38,61 @@ def name_of(path):
     return ".".join(["forbes", *path.relative_to(FORBES).with_suffix("").parts])
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_a_module_imports_nothing_from_its_right(path):
-    parts = {part_of(name) for name in imports_of(path) if name.startswith("forbes.") and not name.endswith("__")}
-
-    assert parts <= {*LINE[: LINE.index(part_of(name_of(path))) + 1]}
-
-
-def test_every_package_has_its_place_in_the_line():
-    assert {part_of(name_of(path)) for path in MODULES} == {*LINE}
-
-
-@pytest.mark.parametrize("path", [p for p in MODULES if part_of(name_of(p)) in ("evaluation", "figures")], ids=name_of)
-def test_evaluation_and_figures_do_not_know_the_trainer(path):
-    assert not {name.rpartition(".")[2] for name in imports_of(path)} & {"Trainer", "LightningCLI"}
+@pytest.fixture(scope="module")
+def imports():
+    """The full names that each module imports, anywhere in it, by the module's name."""
+    found = {}
+    for path in MODULES:
+        names = found[name_of(path)] = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
 
 
-@pytest.mark.parametrize("path", [p for p in MODULES if part_of(name_of(p)) == "envs"], ids=name_of)
-def test_only_one_adapter_knows_the_known_processes(path):
-    parts = {part_of(name) for name in imports_of(path) if name.startswith("forbes.")}
+def test_a_module_imports_nothing_from_its_right(imports):
+    wrong = {}
+    for module, names in imports.items():
+        parts = {part_of(name) for name in names if name.startswith("forbes.") and not name.endswith("__")}
+        wrong[module] = parts - {*LINE[: LINE.index(part_of(module)) + 1]}
 
-    assert "pomdps" not in parts or path.stem in ("known_process", "tasks")
-
-
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_a_module_can_be_read_in_one_sitting(path):
-    assert len(path.read_text().splitlines()) <= 350
+    assert not {module: parts for module, parts in wrong.items() if parts}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_no_module_unpickles(path):
-    assert not {name.split(".")[0] for name in imports_of(path)} & {"dill", "cloudpickle", "marshal", "shelve"}
-    text = path.read_text()
-    assert not [word for word in ("weights_only=False", "allow_pickle=True", "pickle.load") if word in text]
+def test_every_package_has_its_place_in_the_line(imports):
+    assert {part_of(module) for module in imports} == {*LINE}
+
+
+def test_evaluation_and_figures_do_not_know_the_trainer(imports):
+    trainers = {
+        module: {name.rpartition(".")[2] for name in names} & {"Trainer", "LightningCLI"}
+        for module, names in imports.items()
+        if part_of(module) in ("evaluation", "figures")
+    }
+
+    assert trainers
+    assert not {module: found for module, found in trainers.items() if found}
+
+
+def test_only_one_adapter_knows_the_known_processes(imports):
+    knowing = {
+        module
+        for module, names in imports.items()
+        if part_of(module) == "envs" and any(part_of(name) == "pomdps" for name in names if name.startswith("forbes."))
+    }
+
+    assert knowing == {"forbes.envs.known_process", "forbes.envs.tasks"}
+
+
+def test_a_module_can_be_read_in_one_sitting():
+    assert not [name_of(path) for path in MODULES if len(path.read_text().splitlines()) > 350]
+
+
+def test_no_module_unpickles(imports):
+    packages = {module: {name.split(".")[0] for name in names} for module, names in imports.items()}
+    assert not [module for module in packages if packages[module] & {"dill", "cloudpickle", "marshal", "shelve"}]
+
+    words = ("weights_only=False", "allow_pickle=True", "pickle.load")
+    assert not [name_of(path) for path in MODULES if any(word in path.read_text() for word in words)]

@@ -4,11 +4,13 @@ The cell tagged `parameters` has the sizes of the stored outputs; its metadata `
 """
 
 import json
+import os
 import re
 from pathlib import Path
 
 import nbformat
 import pytest
+from jupyter_client import KernelManager
 from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
@@ -24,16 +26,34 @@ def outputs(path):
     return [output for cell in read(path).cells if cell.cell_type == "code" for output in cell.outputs]
 
 
+@pytest.fixture(scope="module")
+def kernel():
+    """A process for all notebooks, one after the other: it imports torch and Lightning once."""
+    manager = KernelManager()
+    manager.start_kernel(env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"})
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
 @pytest.mark.slow
 @notebook
-def test_a_notebook_runs(path, tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+def test_a_notebook_runs(path, kernel, tmp_path):
     content = read(path)
     (sizes,) = [cell for cell in content.cells if "parameters" in cell.metadata.get("tags", ())]
     (sizes.source,) = sizes.metadata.tiny
 
-    NotebookClient(content, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    begin = f"""\
+%reset_selective -f ^[^_]
+%cd -q {tmp_path}
+__import__("sys").path.insert(0, {str(tmp_path)!r})  # for the processes that it starts
+"""
+    content.cells.insert(0, nbformat.v4.new_code_cell(begin))
+
+    client = NotebookClient(content, km=kernel, timeout=300)
+    try:
+        client.execute()
+    finally:
+        client.kc.stop_channels()
 
 
 @notebook

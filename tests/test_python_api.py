@@ -70,9 +70,9 @@ def test_importing_forbes_imports_nothing_heavy():
     assert done.stdout.strip() == ""
 
 
-def test_training_without_the_control_suite_does_not_import_it():
+def test_the_command_of_a_training_imports_neither_the_control_suite_nor_pandas():
     """MuJoCo chooses its rendering when it is imported, and fails on a machine that has none."""
-    program = "import sys, forbes.commands.fit; print(*{'dm_control', 'mujoco', 'OpenGL'} & {*sys.modules})"
+    program = "import sys, forbes.commands.fit; print(*{'dm_control', 'mujoco', 'OpenGL', 'pandas'} & {*sys.modules})"
 
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
 

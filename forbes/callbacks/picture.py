@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from lightning import Callback, LightningModule, Trainer
@@ -69,7 +69,7 @@ class FileCallback(Callback, ABC):
         self._write(trainer, pl_module)
 
     def _write(self, trainer: Trainer, module: LightningModule) -> None:
-        if trainer.fast_dev_run:  # it has neither a run folder nor metrics
+        if _is_dry(trainer):  # it has neither a run folder nor metrics
             return
         folder = trainer.log_dir  # a collective operation, so every process must call it
         if folder is None or not trainer.is_global_zero:
@@ -93,6 +93,11 @@ class PictureCallback(FileCallback):
     def write(self, trainer: Trainer, module: WorldModel, data: SequenceDataModule, path: Path) -> None:
         """Draw the figure and save it."""
         save_figure(self.draw(trainer, module, data), path)
+
+
+def _is_dry(trainer: Trainer) -> bool:
+    """Return whether this is a run of a few updates that leaves nothing, `--trainer.fast_dev_run`."""
+    return bool(cast(Any, trainer).fast_dev_run)
 
 
 @contextmanager
@@ -137,7 +142,7 @@ def require_context(callback: Callback, trainer: Trainer, context: int) -> None:
 
 def require_metrics(callback: Callback, trainer: Trainer) -> None:
     """Raise a ForbesError if the training does not write the `metrics.jsonl` that the callback draws."""
-    if not trainer.fast_dev_run and not any(isinstance(logger, JsonLinesLogger) for logger in trainer.loggers):
+    if not _is_dry(trainer) and not any(isinstance(logger, JsonLinesLogger) for logger in trainer.loggers):
         raise ForbesError(
             f"{type(callback).__name__}: draws metrics.jsonl, which this training does not write. Remove this "
             "callback, or keep the logger of `forbes fit`"

@@ -1,7 +1,7 @@
 """`forbes compare`: train several configurations with several seeds, evaluate them, and compare the results."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -115,11 +115,21 @@ def _train(trainings: Sequence[Training], launcher: Launcher) -> None:
         raise not_finished(failed, len(trainings))
 
 
-def _is_measured(run: str, metrics: Iterable[str], seed: int) -> bool:
-    """Return whether every metric is recorded for the run's current checkpoint and this random seed."""
+def _is_measured(run: str, metrics: Mapping[str, str], seed: int) -> bool:
+    """Return whether every metric is recorded for the run's current checkpoint and sequences and this random seed.
+
+    Args:
+        run: run folder.
+        metrics: hash of the sequences by metric.
+        seed: random seed.
+    """
     record, checkpoint = read_record(run), open_checkpoint(RunFolder(run).checkpoint).sha256
-    entries = [record.get(metric, {}) for metric in metrics]
-    return all(entry.get("checkpoint") == checkpoint and entry.get("seed") == seed for entry in entries)
+    return all(
+        (entry := record.get(metric, {})).get("checkpoint") == checkpoint
+        and entry["seed"] == seed
+        and entry["data"]["sha256"] == sha256
+        for metric, sha256 in metrics.items()
+    )
 
 
 def _write(comparison: Comparison, families: Sequence[Family], folder: Path, command: str) -> None:

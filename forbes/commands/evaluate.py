@@ -9,10 +9,11 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from forbes.choices import PASSES, SUBSET, Split
-from forbes.commands.parsers.evaluate import parser
+from forbes.commands.parsers.evaluate import parser, require_effect
 from forbes.commands.tables import (
     print_degradation,
     print_images,
@@ -20,7 +21,7 @@ from forbes.commands.tables import (
     print_references,
     print_runs,
 )
-from forbes.data import Simulated
+from forbes.data import Replay, Simulated
 from forbes.errors import ForbesError
 from forbes.evaluation.adapters import adapter_folder, load_all
 from forbes.evaluation.estimates import Estimate
@@ -50,7 +51,7 @@ from forbes.evaluation.scoring import (
 )
 from forbes.runs.folder import RunFolder
 from forbes.runs.launched import connected, is_first, num_from_torchrun
-from forbes.runs.provenance import command_line, commit, origin
+from forbes.runs.provenance import code_sha256, command_line, origin
 
 __all__ = ["WantedMetrics", "evaluate", "main", "wanted_metrics"]
 
@@ -64,6 +65,8 @@ class _Job(NamedTuple):
     """Number of sequences, from the first of the split."""
     sha256: list[str]
     """Hash of the sequences in each run's data."""
+    whole: bool
+    """Whether these are all sequences of the split, of every run."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -83,7 +86,7 @@ def _main(argv: Sequence[str]) -> None:
         if folder != RunFolder(run).results:
             print(f"the results of {run} go to {folder}", flush=True)
     agents = bool(args.runs) and is_agent(args.runs[0])
-    _require_no_others(args, agents)
+    require_effect(args, agents)
     if agents:
         if args.model:
             raise ForbesError(f"{args.runs[0]}: an agent is evaluated by its return, a --model has none. Name others")
@@ -104,6 +107,7 @@ def _main(argv: Sequence[str]) -> None:
     if not is_first():
         return
     print_runs(measured)
+    _tell_shared_episodes(measured, args.split)
     print_references(measured)
     if len(measured) > 1:
         print_pairs(compare_pairs(measured))
@@ -111,13 +115,15 @@ def _main(argv: Sequence[str]) -> None:
     print_images(measured)
 
 
-def _require_no_others(args: Any, agents: bool) -> None:
-    """Refuse options that would have no effect: those of scores for agents, and those of episodes for world models."""
-    of_scores = ("scores", "split", "sequences", "samples", "particles", "futures", "context", "batch_size", "data")
-    for name in of_scores if agents else ("episodes", "acting_samples"):
-        if getattr(args, name) != parser().get_default(name):
-            kind = "world models" if agents else "agents"
-            raise ForbesError(f"--{name.replace('_', '-')}: is for {kind}, and none is named. Leave it out")
+def _tell_shared_episodes(measured: Sequence[EvaluatedRun], split: Split) -> None:
+    """Print that standard errors are too small, where several sequences are parts of one episode."""
+    source = measured[0].run.data.source
+    count = max(int(entry["sequences"]) for entry in measured[0].entries.values())
+    if isinstance(source, Replay) and (episodes := len({*source.episodes(split, torch.arange(count))})) < count:
+        print(
+            f"{count} sequences are parts of {episodes} episodes: standard errors, which take them as independent, are "
+            "too small"
+        )
 
 
 def evaluate(runs: Sequence[TrainedRun], args: Any, command: str, folders: Mapping[str, Path]) -> list[EvaluatedRun]:
@@ -132,7 +138,7 @@ def evaluate(runs: Sequence[TrainedRun], args: Any, command: str, folders: Mappi
     Returns:
         The runs with their scores; nothing in processes other than the first.
     """
-    jobs, code = _jobs(args, runs), commit()
+    jobs, code = _jobs(args, runs), code_sha256()
     saved: list[PartialScores] = []
     measured = [EvaluatedRun(run, {}, {}) for run in runs]
     with connected():
@@ -205,8 +211,8 @@ class WantedMetrics(NamedTuple):
 
     names: list[str]
     """All metrics, in their order."""
-    has: list[str]
-    """Those that the run's model has."""
+    has: dict[str, str]
+    """Those that the run's model has, with the hash of the sequences that are scored."""
 
     @property
     def lacks(self) -> list[str]:
@@ -217,11 +223,16 @@ class WantedMetrics(NamedTuple):
 def wanted_metrics(runs: Sequence[TrainedRun], args: Any) -> list[WantedMetrics]:
     """Return the metrics of `evaluate` for each run."""
     jobs = _jobs(args, runs)
-    return [WantedMetrics(_names(run, jobs, args.split), _names(run, _of(run, jobs), args.split)) for run in runs]
+    found = [
+        (_names(run, jobs, args.split, number), _names(run, _of(run, jobs), args.split, number))
+        for number, run in enumerate(runs)
+    ]
+    return [WantedMetrics([*names], has) for names, has in found]
 
 
-def _names(run: TrainedRun, jobs: Sequence[_Job], split: str) -> list[str]:
-    return [_metric_name(run, job, metric, split) for job in jobs for metric in job.score.metrics]
+def _names(run: TrainedRun, jobs: Sequence[_Job], split: str, number: int) -> dict[str, str]:
+    """Return the metrics of run `number`, with the hash of their sequences."""
+    return {_metric_name(run, job, metric, split): job.sha256[number] for job in jobs for metric in job.score.metrics}
 
 
 def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
@@ -231,19 +242,25 @@ def _jobs(args: Any, runs: Sequence[TrainedRun]) -> list[_Job]:
     _require_scores(runs, scorers, numbers)
     if isinstance(source := runs[0].data.source, Simulated):
         scorers = {"exact": exact_scorer(source.process)} | scorers
-    counts = {name: _count(runs[0], args, sys.maxsize if name in ("exact", "elbo") else SUBSET) for name in scorers}
+    most = {name: sys.maxsize if name in ("exact", "elbo") else SUBSET for name in scorers}
+    counts = {name: min(_count(run, args, most[name]) for run in runs) for name in scorers}
     hashes = {count: _require_same_data(runs, args, count) for count in dict.fromkeys(counts.values())}
     if "open-loop" in counts:
         require_longer(runs[0].path, runs[0].data, args.split, counts["open-loop"], args.context)
-    return [_Job(name, scorer, counts[name], hashes[counts[name]]) for name, scorer in scorers.items()]
+    largest = max(run.data.source.size(args.split) for run in runs)
+    return [
+        _Job(name, scorer, counts[name], hashes[counts[name]], counts[name] == largest)
+        for name, scorer in scorers.items()
+    ]
 
 
 def _require_scores(runs: Sequence[TrainedRun], scorers: Mapping[str, Scorer], numbers: Mapping[str, int]) -> None:
     """Refuse scores that no model has, and numbers of particles or futures that a model cannot use."""
     if not any(scorer.of(run.model).metrics for run in runs for scorer in scorers.values()):
+        why = "does not filter by steps" if "elbo" not in runs[0].model.lacks else "has no density of a posterior"
         raise ForbesError(
-            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(scorers)} score, since it has no density "
-            "of a posterior. Ask for --scores pll or open-loop"
+            f"{runs[0].path}: a {runs[0].family} model has no {' or '.join(scorers)} score, since it {why}. Ask for "
+            "--scores pll or open-loop"
         )
     for run, name in itertools.product(runs, ("pll", "open-loop")):
         if name in numbers:
@@ -252,8 +269,6 @@ def _require_scores(runs: Sequence[TrainedRun], scorers: Mapping[str, Scorer], n
 
 def _require_same_data(runs: Sequence[TrainedRun], args: Any, count: int) -> list[str]:
     """Return the hash of the first sequences in each run's data; refuse runs that are not comparable."""
-    for run in runs:
-        _count(run, args, count)
     hashes = [data_sha256(run.data, args.split, count) for run in runs]
     require_comparable(runs, hashes)
     return hashes
@@ -297,8 +312,7 @@ def _round_trip(run: TrainedRun, args: Any) -> dict[str, dict[str, Any]]:
 
 def _metric_name(run: TrainedRun, job: _Job, metric: str, split: str) -> str:
     """Return the full name of a metric, e.g. `test[:1000]/pll[bernoulli,K=128]`."""
-    whole = job.sequences == run.data.source.size(split)  # type: ignore[arg-type]  # argparse has checked it
-    part = "" if whole else f"[:{job.sequences}]"
+    part = "" if job.whole else f"[:{job.sequences}]"
     tag = job.score.tag if job.name == "exact" else f"{run.model.likelihood.name},{job.score.tag}"
     return f"{split}{part}/{metric}[{tag}]"
 

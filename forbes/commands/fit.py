@@ -33,7 +33,7 @@ from forbes.commands.lower_rate import MOST, LowerRateError, at_half_the_rate
 from forbes.commands.next_steps import next_steps
 from forbes.commands.parsers.fit import DESCRIPTION, run_options
 from forbes.commands.trainer_arguments import require_processes, require_usable
-from forbes.data import Experience, SequenceDataModule
+from forbes.data import SequenceDataModule
 from forbes.errors import ForbesError
 from forbes.runs.checkpoint import read_checkpoint
 from forbes.runs.config_errors import building, one_sentence, raised_inside, said_by_lightning
@@ -209,10 +209,8 @@ class _Experiment(LightningCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Build the trainer. For `fit`, open the run folder and add the callbacks and loggers that write to it."""
         config = self.config_init["trainer"]
-        require_usable(config, self.model, self.datamodule)
+        require_usable(config, self.command, self.model, self.datamodule)
         require_processes(config, self.command, self.options.on_divergence)
-        if self.command != "fit" and isinstance(self.datamodule.source, Experience):
-            raise ForbesError(f"forbes {self.command}: an agent is measured by its returns. Use: forbes evaluate RUN")
         callbacks, plugins = _as_list(config["callbacks"]), _as_list(config["plugins"])
         if config["enable_progress_bar"] is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(progress())

@@ -15,8 +15,8 @@ from forbes.data.episodes.store import EpisodeStore
 from forbes.data.exports import export_store
 from forbes.data.imports.formats import open_reader
 from forbes.data.imports.importing import import_episodes, is_imported, partial_path
-from forbes.data.imports.source import SAMPLE, Source
-from forbes.data.imports.survey import survey
+from forbes.data.imports.source import Source
+from forbes.data.imports.survey import SAMPLE, survey
 from forbes.files import require_room
 
 __all__ = ["export", "import_"]

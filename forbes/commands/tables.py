@@ -104,7 +104,7 @@ def print_degradation(measured: Sequence[EvaluatedRun]) -> None:
 
 def print_images(measured: Sequence[EvaluatedRun]) -> None:
     """Print PSNR and SSIM one step and every five steps after the context, next to those of the last frame."""
-    for name, entry in measured[0].images.items():
+    for name, entry in {name: entry for each in reversed(measured) for name, entry in each.images.items()}.items():
         digits, unit = (1, " in dB") if entry["unit"] == "dB" else (3, "")
         shown = [steps for steps in range(1, len(entry["model"]) + 1) if steps == 1 or steps % 5 == 0]
         curves = {str(number): each.images.get(name, {}).get("model") for number, each in enumerate(measured, start=1)}

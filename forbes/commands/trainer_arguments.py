@@ -97,17 +97,20 @@ _OF_AN_AGENT = (
 )
 
 
-def require_usable(trainer: Namespace, model: LightningModule, data: SequenceDataModule) -> None:
-    """Refuse arguments of the Trainer that would not have their documented effect.
+def require_usable(trainer: Namespace, command: str, model: LightningModule, data: SequenceDataModule) -> None:
+    """Refuse arguments of the Trainer that would not have their documented effect, and loops that an agent has not.
 
     Args:
         trainer: section `trainer` of the configuration, with its classes instantiated.
+        command: fit, validate, test or predict.
         model: module to train.
         data: data module.
 
     Raises:
-        ForbesError: for the first refused argument.
+        ForbesError: for the first refused argument, or the loop.
     """
+    if command != "fit" and isinstance(data.source, Experience):
+        raise ForbesError(f"forbes {command}: an agent is measured by its returns. Use: forbes evaluate RUN")
     rules = list(_ALWAYS)
     rules += _OF_SEVERAL_PROCESSES if _num_processes(trainer) > 1 else ()
     rules += _OF_A_WORLD_MODEL if isinstance(model, WorldModel) else ()

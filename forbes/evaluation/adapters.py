@@ -84,7 +84,8 @@ def load_adapter(
 
 def adapter_folder(words: Sequence[str], output: str | None) -> Path:
     """Return the folder of the results: a name made of the words, in `output` or in the current folder."""
-    return Path(output or ".") / re.sub(r"[^\w.=-]+", "-", " ".join(words)).strip(".-")
+    name = re.sub(r"[^\w.=-]+", "-", " ".join(words)).strip(".-")
+    return Path(output or ".") / re.sub(r"\.ckpt$", "-ckpt", name)  # a path that ends in .ckpt is a checkpoint
 
 
 def _class(path: str, where: str) -> type[BeliefModel]:

@@ -25,7 +25,7 @@ from torch import Tensor
 from forbes.data import SequenceBatch, SequenceData, Simulated, Split, Strokes
 from forbes.evaluation.metrics import score_of
 from forbes.evaluation.ngram import fit_ngrams
-from forbes.models import Likelihood, Normal, PartsLikelihood, SymlogNormal, VectorNormal
+from forbes.models import Bernoulli, Likelihood, Normal, OnePixel, PartsLikelihood, SymlogNormal, VectorNormal
 from forbes.seeding import forked
 
 __all__ = ["best_reference", "lowest_above", "merge_equal", "reference_means", "references"]
@@ -42,7 +42,7 @@ def references(data: SequenceData, likelihood: Likelihood, split: Split, count: 
     if _is_gaussian(likelihood) and not isinstance(data.source, Simulated):  # a density, also of strokes
         with forked("cpu", 0):  # for the dequantisation noise of coarse pixels
             return _predictions(data, likelihood, split, count)
-    if isinstance(data.source, Strokes):
+    if isinstance(data.source, Strokes) and isinstance(likelihood, Bernoulli | OnePixel):  # not of another density
         ngrams = fit_ngrams(data.source, data.length)
         return {f"{order}-gram": values for order, values in ngrams.log_prob(split, count).items()}
     return {}

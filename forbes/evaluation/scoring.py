@@ -22,11 +22,12 @@ from forbes.choices import PASSES, SUBSET
 from forbes.data import SequenceBatch, SequenceData, Split
 from forbes.distributed import num_ranks, of_all_ranks, rank
 from forbes.errors import ForbesError, require_at_least
+from forbes.evaluation.adapter_checks import check_model
 from forbes.evaluation.estimates import Estimate
 from forbes.evaluation.runs import split_batches
 from forbes.evaluation.scores import Increments, score_open_loop, score_particles, score_predictions, score_trajectories
 from forbes.files import replace_file
-from forbes.models import BeliefModel, PartsLikelihood
+from forbes.models import BeliefModel, ModelAdapter, PartsLikelihood
 from forbes.pomdps import Process
 from forbes.reading import read_npz
 from forbes.seeding import derive_seed, forked
@@ -145,7 +146,7 @@ def evaluate(
 
     Raises:
         ForbesError: if a score does not exist or is not finite, a number is below 1, there are fewer than two
-            sequences, or one of them ends within the context.
+            sequences, one of them ends within the context, or a `ModelAdapter` does not do what it must.
 
     Example:
         >>> data = forbes.SequenceDataModule(forbes.Strokes(), length=30)
@@ -161,6 +162,8 @@ def evaluate(
     count = min(sequences, data.source.size(split))
     if count < 2:
         raise ForbesError(f"evaluate: a standard error needs at least 2 sequences, found {count}. Choose more")
+    if isinstance(model, ModelAdapter):
+        check_model(model, data, type(model).__name__)
     numbers = {"samples": samples, "particles": particles, "futures": futures}
     found: dict[str, Estimate] = {}
     for name in scores:
@@ -239,7 +242,8 @@ def score_split(
         model: model in eval mode. Scores are computed on its device.
         batches: index of the first sequence of each batch, and the batch on the CPU.
         score: scorer to apply.
-        seed: random seed for the noise, which depends on nothing else but the batches.
+        seed: random seed for the noise, which depends on nothing else but the batches. These are halved where memory
+            does not suffice.
         where: name of the model and the split, for error messages.
         parts: scores saved by an interrupted evaluation; new ones are saved there too.
         per_rank: whether all ranks call this, and share the batches out. Each gets all scores.
@@ -311,7 +315,8 @@ def require_finite(where: str, first: int, scores: Increments) -> None:
             row = int(broken[0])
             raise ForbesError(
                 f"{where}: the {name} of sequence {first + row} is {values[row].sum().item()}, expected a finite "
-                "number. The training diverged: train again with a smaller learning_rate"
+                "number. The likelihood gives the sequence probability 0, or the training diverged: train again with a "
+                "smaller learning_rate"
             )
 
 

@@ -43,7 +43,7 @@ class ModelAdapter(PosteriorModel):
 
     Scores that a model lacks are n/a. `embed_target` may be overridden with the encoder, which then runs once for a
     sequence, not in each step of each sample. Of a model without steps, e.g. a transformer, override `beliefs`. An own
-    `Likelihood` may raise NotImplementedError in `sample` and `mean`; completions, PSNR and SSIM are then n/a.
+    `Likelihood` may raise NotImplementedError in `sample` and `mean`; then PSNR and SSIM are n/a, completions refused.
 
     Without densities, the PLL is :math:`\log \frac1K \sum_k p(o_t \mid \tilde h_t^k, \tilde s_t^k)` with K independent
     draws of the belief after t - 1 observations, each predicted one step. The mean is an unbiased estimate of
@@ -149,7 +149,15 @@ class ModelAdapter(PosteriorModel):
         )
 
     def filter(self, embedding: Tensor, action: Tensor, start: State | None = None) -> Filtered:
-        """See `PosteriorModel.filter`, from `initial`. The context of a step is e_t."""
+        """See `PosteriorModel.filter`. The context of a step is e_t.
+
+        Raises:
+            ForbesError: for another start than `initial`.
+        """
+        if start is not None:
+            raise ForbesError(
+                f"{type(self).__name__}: the filter of an adapter starts at `initial`, found a start. Call `observe`"
+            )
         drawn = self.beliefs(embedding, action)
         return Filtered(*drawn, embedding, self._log_posterior(drawn, embedding))
 

@@ -65,7 +65,7 @@ class EncodedSequence(NamedTuple):
     target: Tensor
     """o_t as `Likelihood.target` or `Likelihood.sample` gives it, `(B, T, *O)`."""
     embedding: Tensor
-    """e_t, `(B, T, E)`; of a `ModelAdapter` any `(B, T, *E)`."""
+    """e_t, `(B, T, E)`."""
     action: Tensor
     """a_{t-1}, `(B, T, A)`."""
 

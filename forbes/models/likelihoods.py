@@ -63,6 +63,15 @@ def sum_of_parts(parts: Mapping[str, Tensor]) -> Tensor:
     return sum(others, first)
 
 
+def _require_binary(name: str, observation: Tensor) -> None:
+    least, most = observation.min().item(), observation.max().item()
+    if not 0 <= least <= most <= 1:
+        raise ForbesError(
+            f"{name}: observations have values from {least:g} to {most:g}, expected 0 and 1. Use Normal as "
+            "model.likelihood"
+        )
+
+
 class Bernoulli(Likelihood):
     r"""Binary pixels with the output u as logit: :math:`\log p(x) = \sum x u - \mathrm{softplus}(u)`.
 
@@ -77,12 +86,7 @@ class Bernoulli(Likelihood):
 
     def check(self, observation: Tensor) -> None:
         """See `Likelihood.check`: values 0 and 1."""
-        least, most = observation.min().item(), observation.max().item()
-        if not 0 <= least <= most <= 1:
-            raise ForbesError(
-                f"{type(self).__name__}: observations have values from {least:g} to {most:g}, expected 0 and 1. Use "
-                "Normal as model.likelihood"
-            )
+        _require_binary(type(self).__name__, observation)
 
     def target(self, observation: Tensor) -> Tensor:
         """See `Likelihood.target`: 0/1 as they are."""
@@ -121,7 +125,7 @@ class OnePixel(Likelihood):
 
     def check(self, observation: Tensor) -> None:
         """See `Likelihood.check`: values 0 and 1, no more than one 1 in a frame."""
-        Bernoulli().check(observation)
+        _require_binary(type(self).__name__, observation)
         most = int(observation.flatten(-3).sum(-1, dtype=torch.long).max())
         if most > 1:
             raise ForbesError(

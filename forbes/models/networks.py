@@ -3,13 +3,13 @@
 import math
 from collections.abc import Callable, Mapping
 from itertools import chain, pairwise
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, cast
 
 from torch import Tensor, nn
 from torch.nn.functional import elu, layer_norm, relu, silu
 
 from forbes.configured import Configurable
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.performance.convolutions import convolve
 from forbes.performance.fusion import Elementwise, fused
 from forbes.performance.recurrence import Layer, prepare_mlp
@@ -85,7 +85,7 @@ class MLP(nn.Sequential):
 
 def _layer(linear: nn.Module, activation: nn.Module) -> Layer:
     """Return a linear layer and its activation for a time loop."""
-    weight, bias = linear.get_parameter("weight"), linear.get_parameter("bias")
+    weight, bias = (cast(Tensor, getattr(linear, name)) for name in ("weight", "bias"))  # frozen ones are tensors
     return Layer(weight, bias, _FUNCTIONS[type(activation)], tuple(activation.parameters()))
 
 
@@ -134,6 +134,7 @@ class MLPEncoder(Encoder):
 
     def __init__(self, observation_shape: Shape, width: int = 200, layers: int = 2) -> None:
         super().__init__()
+        require_at_least(1, "MLPEncoder", width=width, layers=layers)
         self.embedding_dim = width
         self.net = MLP(math.prod(one_array(observation_shape, "MLPEncoder")), width, layers)
 
@@ -169,6 +170,7 @@ class MLPDecoder(Decoder):
         output_bias: float = 0.0,
     ) -> None:
         super().__init__()
+        require_at_least(1, "MLPDecoder", width=width, layers=layers)
         self.observation_shape = one_array(observation_shape, "MLPDecoder")
         last = nn.Linear(width, math.prod(self.observation_shape))
         if output_bias:
@@ -232,6 +234,7 @@ class ConvEncoder(Encoder):
 
     def __init__(self, observation_shape: Shape, channels: int = 32) -> None:
         super().__init__()
+        require_at_least(1, "ConvEncoder", channels=channels)
         shape = one_array(observation_shape, "ConvEncoder")
         layers, sides = _convolutions(shape, "Encoder")
         widths = [shape[0], *(channels * 2**layer for layer in range(layers))]
@@ -273,6 +276,7 @@ class ConvDecoder(Decoder):
         self, feature_dim: int, observation_shape: Shape, channels: int = 32, output_bias: float = 0.0
     ) -> None:
         super().__init__()
+        require_at_least(1, "ConvDecoder", channels=channels)
         shape = one_array(observation_shape, "ConvDecoder")
         layers, encoded = _convolutions(shape, "Decoder")
         depth, *sides = shape

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, relu
 
-from forbes.errors import ForbesError
+from forbes.errors import ForbesError, require_at_least
 from forbes.models.networks import Decoder, Encoder, one_array
 from forbes.shapes import Shape
 
@@ -37,6 +37,7 @@ class PixelEncoder(Encoder):
 
     def __init__(self, observation_shape: Shape, width: int = 256) -> None:
         super().__init__()
+        require_at_least(1, "PixelEncoder", width=width)
         height, self.side = _sides(one_array(observation_shape, "PixelEncoder"), "Encoder")
         self.embedding_dim = width
         self.pixel = nn.Embedding(height * self.side, width)
@@ -80,6 +81,8 @@ class PixelDecoder(Decoder):
 
     def __init__(self, feature_dim: int, observation_shape: Shape, width: int = 256, blocks: int = 1) -> None:
         super().__init__()
+        require_at_least(1, "PixelDecoder", width=width)
+        require_at_least(0, "PixelDecoder", blocks=blocks)
         self.observation_shape = one_array(observation_shape, "PixelDecoder")
         height, side = _sides(self.observation_shape, "Decoder")
         self.first = nn.Linear(feature_dim, width)

@@ -123,25 +123,11 @@ class StateSpaceModel(PosteriorModel, RecurrentModel):
 
     def imagine(self, start: State, action: Tensor) -> Rollout:
         """See `BeliefModel.imagine`: a rollout of the prior."""
-        given = iter(action.unbind(1))
-        return self.rollout(start, lambda _: next(given), action.shape[1])
-
-    def rollout(self, start: State, policy: Callable[[Tensor], Tensor], steps: int) -> Rollout:
-        """Roll out the prior from `start`, every row along its own trajectory and by its own actions.
-
-        Args:
-            start: (h, s), `(B, ...)`.
-            policy: features of a state, `(B, H + D)`, to the action taken in it, `(B, A)`.
-            steps: T; the policy acts in `start` and in all steps but the last.
-
-        Returns:
-            The T steps after `start`, without `start` itself.
-        """
         state, states, log_probs = start, [], []
         with full_precision(start.state):
-            step = self.prepare_imagination(len(start.state), steps)
-            for _ in range(steps):
-                state, log_prob = step(state, policy(torch.cat(state, -1)))
+            step = self.prepare_imagination(*action.shape[:2])
+            for taken in action.unbind(1):
+                state, log_prob = step(state, taken)
                 states.append(state)
                 log_probs.append(log_prob)
         hidden, drawn = (torch.stack(values, 1) for values in zip(*states, strict=True))  # (B, T, H), (B, T, D)

@@ -7,7 +7,7 @@ r"""A belief without a distribution: h_t itself, which predicts the next observa
 
 Nothing is sampled, so the likelihood is exact, by the chain rule, and no bound is needed. In imagination, the learned
 embedding :math:`\bar e` of "nothing seen" replaces missing observations: the simulator of Gregor et al., 2019,
-arXiv 1906.09237. One-step predictions alone would never train it, so it is trained by overshooting.
+arXiv 1906.09237. One-step predictions train it at the first step of a sequence only, hence overshooting.
 """
 
 from typing import ClassVar

@@ -1,5 +1,7 @@
 """Convolutions of many frames on a CPU, as fast as it can: the layers that `forbes.models.networks` defines."""
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 
@@ -45,4 +47,4 @@ def _enlarge_pixel(layer: nn.ConvTranspose2d, pixel: Tensor) -> Tensor:
     """Return layer(pixel) for maps of one pixel: `(N, C, 1, 1)` to `(N, C', K, K)`."""
     product = pixel.flatten(1) @ layer.weight.flatten(1)  # (N, C' K K)
     kernels: Tensor = product.unflatten(1, layer.weight.shape[1:])  # (N, C', K, K)
-    return kernels + layer.get_parameter("bias").view(-1, 1, 1)
+    return kernels + cast(Tensor, layer.bias).view(-1, 1, 1)  # frozen, it is a tensor and no parameter

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from forbes.errors import require_at_least, require_positive
+from forbes.errors import ForbesError, require_at_least, require_positive
 from forbes.pomdps.base import ExactFilter, Process
 from forbes.pomdps.distributions import DiagonalGaussian
 from forbes.pomdps.grid import Grid, grid_filter
@@ -27,6 +27,9 @@ class MirrorSensor(Process):
         cells: number of cells of the grid on [-6, 6]. With 1601, a cell is a thirteenth of the default :math:`\sigma`
             wide, and log p(o_1:30) has an error of 1e-7 nats; with 401, 1e-5.
 
+    Raises:
+        ForbesError: if a cell is wider than :math:`\sigma`, with which log p is off by nats.
+
     Example:
         >>> process = forbes.MirrorSensor()
         >>> states, observations, actions = process.sample(4, 10, torch.Generator().manual_seed(0))
@@ -43,6 +46,11 @@ class MirrorSensor(Process):
         require_at_least(2, "MirrorSensor", cells=cells)
         self.observation_std = observation_std
         self.grid = Grid.around_kink(-HALF_WIDTH, HALF_WIDTH, cells, kink=0.0)  # |s| has a kink at 0
+        if self.grid.width > observation_std:
+            raise ForbesError(
+                f"MirrorSensor: a cell of its grid is {self.grid.width:g} wide, expected at most observation_std, "
+                f"{observation_std:g}, so that beliefs are exact. Set more cells"
+            )
 
     def initial(self, like: Tensor) -> DiagonalGaussian:
         """See `Process.initial`."""

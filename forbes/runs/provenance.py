@@ -1,5 +1,6 @@
 """Provenance of a run: command, time, machine, versions and data."""
 
+import hashlib
 import os
 import platform
 import shlex
@@ -7,6 +8,7 @@ import subprocess
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from forbes.errors import ForbesError
 from forbes.reading import read_json
 from forbes.runs.configuration import allowed_modules
 
-__all__ = ["command_line", "commit", "describe_start", "origin", "read_provenance"]
+__all__ = ["code_sha256", "command_line", "commit", "describe_start", "origin", "read_provenance"]
 
 PACKAGES = ("torch", "lightning", "jsonargparse", "numpy", "dm-control", "mujoco", "gymnasium")
 """Packages that may change the results of a run; gymnasium is optional."""
@@ -71,6 +73,15 @@ def origin(command: str, seed: int) -> dict[str, Any]:
     """Return command, commit, random seed and date, for the record of a result."""
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return {"command": command, "commit": commit(), "seed": seed, "date": date}
+
+
+@cache
+def code_sha256() -> str:
+    """Return a hash of this package's modules: of what is installed, or of a checkout with its changes."""
+    found = hashlib.sha256()
+    for path in sorted(Path(forbes.__file__).parent.rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.hexdigest()
 
 
 def commit() -> str | None:

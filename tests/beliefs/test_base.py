@@ -5,7 +5,7 @@ whose support can be listed.
 """
 
 import math
-from functools import partial
+from functools import cache, partial
 
 import pytest
 import torch
@@ -78,6 +78,12 @@ def probability_on_grid(head, context, half_width=20.0, cells=500):
     return edges[1:], (density * side**2).view(cells, cells)
 
 
+@cache
+def seeded_grid(family, seed):
+    """`probability_on_grid` for the head and the context of a seed."""
+    return probability_on_grid(random_head(family, seed=seed), contexts(1, seed)[0])
+
+
 def support(head):
     """Every state that a discrete head can give, (P, D): each variable takes each of its classes."""
     one_hot, number = torch.eye(CLASSES, dtype=torch.float64), head.state_dim // CLASSES
@@ -139,9 +145,7 @@ def test_the_path_gradient_of_a_kl_is_unbiased(continuous):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_density_integrates_to_one(continuous, seed):
-    head = random_head(continuous, seed=seed)
-
-    _, probability = probability_on_grid(head, contexts(1, seed)[0])
+    _, probability = seeded_grid(continuous, seed)
 
     # The midpoint rule is exact to 1e-6 for densities this smooth; the rest are tails beyond the square.
     assert probability.sum().item() == pytest.approx(1, abs=1e-4)
@@ -158,9 +162,9 @@ def test_probabilities_sum_to_one(discrete, seed):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_samples_follow_the_density(continuous, seed):
+    edges, probability = seeded_grid(continuous, seed)
     head, context, number = random_head(continuous, seed=seed), contexts(1, seed)[0], 20_000
 
-    edges, probability = probability_on_grid(head, context)
     samples = head.rsample(context, (number,))[0].detach()  # (number, 2)
 
     # Kolmogorov-Smirnov in each marginal: the distance exceeds sqrt(-log(a / 2) / 2 n) with probability a = 1e-4.

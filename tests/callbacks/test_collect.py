@@ -4,6 +4,8 @@ import errno
 import os
 import shutil
 import signal
+from contextlib import redirect_stdout
+from io import StringIO
 
 import numpy as np
 import pandas as pd
@@ -26,9 +28,28 @@ from forbes.training.loading import load_run
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run_and_output(tmp_path_factory):
     folder = tmp_path_factory.mktemp("agent")
-    assert fit("--config", write_config(folder), "--run_dir", folder / "run") == 0
+    with redirect_stdout(StringIO()) as output:
+        assert fit("--config", write_config(folder), "--run_dir", folder / "run") == 0
+    return folder / "run", output.getvalue()
+
+
+@pytest.fixture(scope="module")
+def run(run_and_output):
+    return run_and_output[0]
+
+
+def write_overlap(folder):
+    """Configure the agent of `run` with episodes that are played while it learns."""
+    (folder / "overlap.yaml").write_text(write_config(folder).read_text().replace("{seed", "{overlap: true, seed"))
+    return folder / "overlap.yaml"
+
+
+@pytest.fixture(scope="module")
+def overlapped(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("overlapped")
+    assert fit("--config", write_overlap(folder), "--run_dir", folder / "run") == 0
     return folder / "run"
 
 
@@ -194,10 +215,8 @@ def test_warns_if_episodes_end_but_the_agent_predicts_no_end(tmp_path):
     assert (read_metrics(tmp_path / "run")["train/continuation"] < 0).sum() == 12  # a log-probability at each update
 
 
-def test_the_progress_counts_both_kinds_of_steps_beside_updates(tmp_path, capsys):
-    assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run") == 0
-
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("epoch ")]
+def test_the_progress_counts_both_kinds_of_steps_beside_updates(run_and_output):
+    lines = [line for line in run_and_output[1].splitlines() if line.startswith("epoch ")]
     assert [line.split("env_steps ")[1].split()[0] for line in lines] == ["48", "72", "96"]
     assert [line.split("agent_steps ")[1].split()[0] for line in lines] == ["16", "24", "32"]
     assert [line.split("update ")[1].split()[0] for line in lines] == ["4/12", "8/12", "12/12"]
@@ -253,12 +272,12 @@ def test_a_failing_environment_ends_training_and_loses_nothing(tmp_path, capsys,
 
 
 def test_a_hanging_environment_ends_training_after_a_timeout(tmp_path, capsys):
-    hangs = ("--data.source.task", "Hanging", "--data.source.options", "{}", "--data.source.timeout", 1)
+    hangs = ("--data.source.task", "Hanging", "--data.source.options", "{}", "--data.source.timeout", 0.5)
 
     assert fit("--config", write_config(tmp_path), *hangs, "--run_dir", tmp_path / "run") == 2
 
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "it hangs, no answer to step within 1 s; episode 0 failed 3 times" in error
+    assert "it hangs, no answer to step within 0.5 s; episode 0 failed 3 times" in error
     for seconds in ("0", ".nan", ".inf"):
         assert fit("--config", write_config(tmp_path), "--data.source.timeout", seconds) == 2
         assert f"Experience: timeout is {float(seconds.strip('.'))}" in capsys.readouterr().err
@@ -369,25 +388,22 @@ def test_a_resumed_run_learns_at_the_rates_it_is_given(run, tmp_path):
     assert len(read_metrics(other)) == 20
 
 
-def test_overlapped_episodes_lag_one_epoch_and_resume_exactly(run, tmp_path, monkeypatch):
+def test_overlapped_episodes_lag_one_epoch_and_resume_exactly(run, overlapped, tmp_path, monkeypatch):
     """The first epoch's agent plays the third episode, as without; from then on it is always one epoch behind."""
 
     def kill(self, loss):
         if self.global_step == 6:
             raise Killed
 
-    text = write_config(tmp_path).read_text().replace("seed_episodes: 2", "seed_episodes: 2, overlap: true")
-    (tmp_path / "overlap.yaml").write_text(text)
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert fit("--config", tmp_path / "overlap.yaml", "--run_dir", whole) == 0
+    cut = tmp_path / "cut"
     with monkeypatch.context() as patch:
         patch.setattr(ImaginationActorCritic, "on_before_backward", kill)
         with pytest.raises(Killed):
-            fit("--config", tmp_path / "overlap.yaml", "--run_dir", cut)
+            fit("--config", write_overlap(tmp_path), "--run_dir", cut)
     assert fit("--resume", cut) == 0
 
-    pd.testing.assert_frame_equal(read_metrics(cut), read_metrics(whole), check_exact=True)
-    stores = [EpisodeStore(path / "episodes") for path in (whole, cut, run)]
+    pd.testing.assert_frame_equal(read_metrics(cut), read_metrics(overlapped), check_exact=True)
+    stores = [EpisodeStore(path / "episodes") for path in (overlapped, cut, run)]
     actions = [[store.episode(number).action for number in store.records] for store in stores]
     assert [len(each) for each in actions] == [5, 5, 4]
     np.testing.assert_array_equal(actions[0], actions[1])
@@ -395,22 +411,21 @@ def test_overlapped_episodes_lag_one_epoch_and_resume_exactly(run, tmp_path, mon
     assert (actions[0][2] != actions[2][2]).any()  # without, the first epoch's updates come before it is played
 
 
-@pytest.mark.parametrize("overlap", ["", ", overlap: true"], ids=["in turns", "overlap"])
+@pytest.mark.parametrize(("whole", "write"), [("run", write_config), ("overlapped", write_overlap)])
 @pytest.mark.parametrize("update", [0, 5, 7])
-def test_a_signal_ends_training_after_an_epoch_losing_nothing(tmp_path, monkeypatch, capfd, overlap, update):
+def test_a_signal_ends_training_after_an_epoch_losing_nothing(
+    tmp_path, monkeypatch, capfd, request, whole, write, update
+):
     """At the first update, in the midst of the second epoch, and at the last of it; resumed, nothing is missing."""
 
     def interrupt(self, loss):
         if self.global_step == update:
             os.kill(os.getpid(), signal.SIGINT)
 
-    text = write_config(tmp_path).read_text().replace("seed_episodes: 2", f"seed_episodes: 2{overlap}")
-    (tmp_path / "agent.yaml").write_text(text)
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    assert fit("--config", tmp_path / "agent.yaml", "--run_dir", whole) == 0
+    whole, stopped = request.getfixturevalue(whole), tmp_path / "stopped"
     with monkeypatch.context() as patch:
         patch.setattr(ImaginationActorCritic, "on_before_backward", interrupt)
-        assert fit("--config", tmp_path / "agent.yaml", "--run_dir", stopped) == 130
+        assert fit("--config", write(tmp_path), "--run_dir", stopped) == 130
     said = capfd.readouterr()
     assert "stopping after this epoch" in said.err
     assert f"stopped at update {4 * (update // 4 + 1)}" in said.out
@@ -442,9 +457,8 @@ def test_a_group_signal_while_the_player_starts_loses_nothing(tmp_path, monkeypa
         os.kill(os.getpid(), number)
 
     monkeypatch.setattr(EpisodeWorker, "_start", start_and_send)
-    (tmp_path / "agent.yaml").write_text(write_config(tmp_path).read_text().replace("{seed", "{overlap: true, seed"))
 
-    assert fit("--config", tmp_path / "agent.yaml", "--run_dir", tmp_path / "run") == 128 + number
+    assert fit("--config", write_overlap(tmp_path), "--run_dir", tmp_path / "run") == 128 + number
 
     assert read_checkpoint(RunFolder(tmp_path / "run").checkpoint)["global_step"] == 4
 

@@ -6,6 +6,8 @@ import re
 import shutil
 import signal
 from collections.abc import Mapping
+from contextlib import redirect_stderr
+from io import StringIO
 
 import pytest
 import torch
@@ -28,19 +30,25 @@ from forbes.training.world_model import LossTerm, WorldModel
 TOO_FAST = ["--model.learning_rate", "1e30"]
 
 
+@pytest.fixture(scope="module")
+def run_and_error(tiny_run, tmp_path_factory):
+    """A run of ten updates that went on with a rate at which nothing stays finite; and what it printed."""
+    run = RunFolder(shutil.copytree(tiny_run, tmp_path_factory.mktemp("diverged") / "run"))
+    with redirect_stderr(StringIO()) as error:
+        assert main(["fit", "--resume", str(run), "--trainer.max_epochs", "3", *TOO_FAST]) == 3
+    return run, error.getvalue()
+
+
 @pytest.fixture
-def diverged(tiny_run, tmp_path, capsys):
-    """A run of ten updates that went on with a rate at which nothing stays finite."""
-    run = RunFolder(shutil.copytree(tiny_run, tmp_path / "run"))
-    before = run.checkpoint.read_bytes()
-    assert main(["fit", "--resume", str(run), "--trainer.max_epochs", "3", *TOO_FAST]) == 3
-    return run, before, capsys.readouterr().err
+def diverged(run_and_error, tmp_path):
+    """A copy of the run, to be changed."""
+    return RunFolder(shutil.copytree(run_and_error[0].path, tmp_path / "run"))
 
 
-def test_the_last_finite_checkpoint_stays_and_advice_is_given(diverged):
-    run, before, error = diverged
+def test_the_last_finite_checkpoint_stays_and_advice_is_given(run_and_error, tiny_run):
+    run, error = run_and_error
 
-    assert run.checkpoint.read_bytes() == before
+    assert run.checkpoint.read_bytes() == RunFolder(tiny_run).checkpoint.read_bytes()
     *_, line = error.splitlines()
     assert line.startswith(f"forbes: {run}: diverged, the loss or gradient of update 12 is not finite.")
     assert line.endswith(f"Give a lower --model.learning_rate to forbes fit --resume {run}")
@@ -49,15 +57,12 @@ def test_the_last_finite_checkpoint_stays_and_advice_is_given(diverged):
 
 
 def test_it_goes_on_at_a_lower_rate(diverged):
-    run, *_ = diverged
-
-    assert main(["fit", "--resume", str(run), "--trainer.max_epochs", "3", "--model.learning_rate", "1e-4"]) == 0
+    assert main(["fit", "--resume", str(diverged), "--trainer.max_epochs", "3", "--model.learning_rate", "1e-4"]) == 0
 
 
 def test_the_update_can_be_computed_again(diverged):
-    run, *_ = diverged
-    failure = torch.load(run.failure, weights_only=True)
-    module, _ = load_run(run.path)
+    failure = torch.load(diverged.failure, weights_only=True)
+    module, _ = load_run(diverged.path)
     module.load_state_dict(failure["state_dict"])
     assert all(parameter.isfinite().all() for parameter in module.parameters())
     (batch,) = (SequenceBatch(**values) for values in failure["batches"])
@@ -72,15 +77,14 @@ def test_the_update_can_be_computed_again(diverged):
 
 def test_replay_names_the_first_tensor_that_is_not_finite(diverged, capsys):
     """It is the output of a module of which the input and all weights are finite."""
-    run, *_ = diverged
-    failure = read_checkpoint(run.failure)
+    failure = read_checkpoint(diverged.failure)
 
-    assert main(["replay", str(run.failure)]) == 0
+    assert main(["replay", str(diverged.failure)]) == 0
 
     said = capsys.readouterr().out
-    assert said.startswith(f"{run.failure}: update 12, recomputed on cpu: the first tensor that is not finite is ")
+    assert said.startswith(f"{diverged.failure}: update 12, recomputed on cpu: the first tensor that is not finite is ")
     name, kind = re.search(r"is the output of ([\w.]+) \((\w+)\): \d+ of \d+ values, shape \(", said).groups()
-    module, _ = load_run(run.path)
+    module, _ = load_run(diverged.path)
     assert type(part := module.get_submodule(name)).__name__ == kind
     module.load_state_dict(failure["state_dict"])
     assert all(parameter.isfinite().all() for parameter in part.parameters())
@@ -176,9 +180,8 @@ def test_replay_sees_running_averages_before_the_update(late, tmp_path, monkeypa
 
 
 def test_replay_repeats_the_noise_and_the_rows_of_each_process(diverged, monkeypatch):
-    run, *_ = diverged
-    failure = read_checkpoint(run.failure)
-    AtomicCheckpointIO().save_checkpoint(failure | {"processes": 2}, run.failure)
+    failure = read_checkpoint(diverged.failure)
+    AtomicCheckpointIO().save_checkpoint(failure | {"processes": 2}, diverged.failure)
     [batch], seen = failure["batches"], []
 
     def remember(self, share):
@@ -186,7 +189,7 @@ def test_replay_repeats_the_noise_and_the_rows_of_each_process(diverged, monkeyp
         return LossTerm(sum(parameter.sum() for parameter in self.parameters()), {})
 
     monkeypatch.setattr(WorldModel, "total_loss", remember)
-    assert main(["replay", str(run.failure)]) == 2  # this loss is finite
+    assert main(["replay", str(diverged.failure)]) == 2  # this loss is finite
 
     assert torch.equal(torch.cat([rows for rows, _ in seen]), batch["observation"])
     purposes = ("update", "update/1")
@@ -215,10 +218,9 @@ def test_replay_of_no_file_is_one_sentence(tiny_run, capsys):
     ],
 )
 def test_replay_refuses_what_is_no_failure_in_one_sentence(diverged, capsys, changes, sentence):
-    run, *_ = diverged
-    AtomicCheckpointIO().save_checkpoint(change(read_checkpoint(run.failure), **changes), run.failure)
+    AtomicCheckpointIO().save_checkpoint(change(read_checkpoint(diverged.failure), **changes), diverged.failure)
 
-    assert main(["replay", str(run.failure)]) == 2
+    assert main(["replay", str(diverged.failure)]) == 2
 
     error = capsys.readouterr().err
     assert error.count("\n") == 1

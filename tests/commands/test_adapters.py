@@ -12,8 +12,9 @@ from command_line import error_of
 
 import forbes
 from forbes.commands.cli import main
-from forbes.evaluation.adapters import load_all
+from forbes.evaluation.adapters import adapter_folder, load_all
 from forbes.evaluation.calibration.runs import calibrate_run
+from forbes.runs.folder import RunFolder
 
 PAGES = Path(__file__).parents[2] / "docs" / "adapters"
 MEASURES = ["--sequences", "6", "--samples", "2", "--particles", "3", "--futures", "4", "--context", "2"]
@@ -51,6 +52,13 @@ def here(trained, tmp_path, monkeypatch):
     yield folder
     for name in ("my_adapter", "their_dreamer", "other"):
         sys.modules.pop(name, None)
+
+
+def test_a_checkpoint_in_the_name_leaves_the_results_in_their_folder():
+    """A path that ends in .ckpt would be taken for a checkpoint of a run, and its record put beside the output."""
+    folder = adapter_folder(["m:Model", "actions=1", "checkpoint=logs/a.ckpt"], "results")
+
+    assert RunFolder(folder).path == folder == Path("results/m-Model-actions=1-checkpoint=logs-a-ckpt")
 
 
 def test_an_adapter_is_filled_in_within_sixty_lines():

@@ -9,19 +9,14 @@ from small_agents import fit, forbes, write_config
 from forbes.data.episodes.store import EpisodeStore
 
 
-def trained(folder, epochs):
-    run = folder / f"run-{epochs}"
-    assert fit("--config", write_config(folder), "--run_dir", run, "--trainer.max_epochs", epochs) == 0
-    return run
-
-
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return trained(tmp_path_factory.mktemp("agent"), 1)
+def run(small_agent):
+    return small_agent
 
 
 def test_an_agent_plays_what_its_training_would_have_played_next(run, tmp_path, capsys):
-    longer = trained(tmp_path, 2)
+    longer = tmp_path / "longer"
+    assert fit("--config", write_config(tmp_path), "--run_dir", longer, "--trainer.max_epochs", 2) == 0
     shutil.copytree(run / "episodes", store := tmp_path / "store")
 
     assert forbes("data", "collect", "--policy", run, "--episodes", 3, "-o", store) == 0

@@ -202,6 +202,19 @@ def test_other_noise_is_measured_anew(configs, compared, tmp_path):
         assert not np.array_equal(read_arrays(str(run))[ELBO], read_arrays(str(other))[ELBO])
 
 
+def test_a_record_of_other_sequences_is_measured_anew(configs, compared, tmp_path):
+    """Episodes were added to a store, for example."""
+    folder = shutil.copytree(compared, tmp_path / "compared")
+    path = folder / "rssm-0" / "evaluation.json"
+    found = json.loads(path.read_text())
+    sha256, found[ELBO]["data"]["sha256"] = found[ELBO]["data"]["sha256"], "of others"
+    path.write_text(json.dumps(found))
+
+    assert main(["compare", *configs, "--scores", "elbo", "-o", str(folder), *MEASURES, *ONE_EPOCH]) == 0
+
+    assert json.loads(path.read_text())[ELBO]["data"]["sha256"] == sha256
+
+
 def test_it_goes_on_where_it_was_stopped(configs, tmp_path, monkeypatch):
     """Killed in the second training, then between the measurement of one run and that of another."""
     command = ["compare", *configs, "--scores", "elbo", "-o", str(tmp_path), *MEASURES, *ONE_EPOCH]

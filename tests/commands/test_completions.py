@@ -27,12 +27,9 @@ NUMBERS = ["--digits", "12", "--samples", "4", "--prefixes", "3", "2"]
 
 
 @pytest.fixture(scope="module")
-def runs(tiny_run, tiny_config, tmp_path_factory):
+def runs(tiny_run, tiny_rssm):
     """A run of FORBES and one of RSSM."""
-    rssm = str(tmp_path_factory.mktemp("completed") / "rssm")
-    fit = ["fit", "--config", str(tiny_config), "--run_dir", rssm]
-    assert main([*fit, "--model.init_args.belief", "GaussianBelief"]) == 0
-    return [str(tiny_run), rssm]
+    return [str(tiny_run), str(tiny_rssm)]
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,10 @@ import pandas as pd
 import pytest
 import yaml
 from command_line import error_of
-from jobs_in_this_process import run_here
+from environment_in_this_process import play_here
+from jobs_in_this_process import configuration_here, run_here
 
-from forbes.commands import budgets, reproduce, score_tables
+from forbes.commands import budgets, reproduce, score_tables, trainings
 from forbes.commands.budgets import Family, Size
 from forbes.commands.cli import main
 from forbes.commands.parsers.reproduce import BUDGETS, PARTS
@@ -24,21 +25,47 @@ from forbes.runs.configs import find_config
 from forbes.runs.folder import read_metrics
 
 
-@pytest.fixture
-def tiny_plan(tiny_config, tmp_path, monkeypatch):
-    """FORBES and an RSSM of the tiny configuration, one seed each, in place of the paper's."""
-    rssm = tmp_path / "rssm.yaml"
+def in_this_process(patch):
+    """Run the jobs here."""
+    patch.setattr(reproduce, "run_jobs", run_here)
+    patch.setattr(trainings, "complete_configuration", configuration_here)
+
+
+@pytest.fixture(scope="module")
+def rssm(tiny_config, tmp_path_factory):
+    """The tiny configuration of an RSSM."""
+    path = tmp_path_factory.mktemp("configs") / "rssm.yaml"
     flow = "{class_path: FlowBelief, init_args: {layers: 2, width: 4}}"
-    rssm.write_text(tiny_config.read_text().replace(flow, "GaussianBelief"))
+    path.write_text(tiny_config.read_text().replace(flow, "GaussianBelief"))
+    return path
+
+
+def plan_tiny(patch, rssm, tiny_config):
+    """Plan FORBES and an RSSM of the tiny configuration, one seed each, in place of the paper's."""
     configs = {"strokes/rssm": str(rssm), "strokes/forbes": str(tiny_config)}
     sizes = {budget: Size(1, 1) for budget in BUDGETS}
     plan = [Family(name, config, "strokes", 5, 2.0, sizes) for name, config in configs.items()]
     nothing = dict.fromkeys(PARTS, list)
-    monkeypatch.setattr(budgets, "_PARTS", nothing | {"strokes": lambda: plan})
-    monkeypatch.setitem(budgets._SMOKE_FLAGS, "strokes", ())
-    monkeypatch.setattr(budgets, "_FIGURES", ())
-    monkeypatch.setattr(reproduce, "run_jobs", run_here)
+    patch.setattr(budgets, "_PARTS", nothing | {"strokes": lambda: plan})
+    patch.setitem(budgets._SMOKE_FLAGS, "strokes", ())
+    patch.setattr(budgets, "_FIGURES", ())
+    in_this_process(patch)
     return plan
+
+
+@pytest.fixture
+def tiny_plan(rssm, tiny_config, monkeypatch):
+    return plan_tiny(monkeypatch, rssm, tiny_config)
+
+
+@pytest.fixture(scope="module")
+def reproduced(rssm, tiny_config, tmp_path_factory):
+    """The folder of the tiny plan, trained and measured."""
+    folder = tmp_path_factory.mktemp("reproduced")
+    with pytest.MonkeyPatch.context() as patch:
+        plan_tiny(patch, rssm, tiny_config)
+        assert main(smoke(folder)) == 0
+    return folder
 
 
 def smoke(folder, *options):
@@ -65,7 +92,12 @@ class Resources(HTMLParser):
         self.anchors |= {found.get("id")}
 
 
-def test_the_smoke_budget_trains_measures_and_reports_everything(tmp_path):
+def test_the_smoke_budget_trains_measures_and_reports_everything(tmp_path, monkeypatch):
+    in_this_process(monkeypatch)
+    play_here(monkeypatch)
+    monkeypatch.setattr("forbes.figures.beliefs._SAMPLES", 200)
+    monkeypatch.setattr("forbes.figures.calibration._SEQUENCES", 40)
+
     assert main(["reproduce", "--budget", "smoke", "-o", str(tmp_path)]) == 0
 
     page = page_of(tmp_path)
@@ -128,32 +160,29 @@ def test_interrupted_it_resumes_where_it_stopped(tiny_plan, tmp_path, monkeypatc
     assert begun == [[f"{tmp_path}/strokes/rssm-0", f"{tmp_path}/strokes/forbes-0"], [f"{tmp_path}/strokes/forbes-0"]]
 
 
-def test_a_step_is_repeated_only_if_a_run_was_trained_further(tiny_plan, tmp_path, monkeypatch):
+def test_a_step_is_repeated_only_if_a_run_was_trained_further(tiny_plan, reproduced, monkeypatch):
     ran = []
 
     def counted(jobs, launcher, *others):
         ran.extend(job.name for job in jobs)
         return run_here(jobs, launcher, *others)
 
-    assert main(smoke(tmp_path)) == 0
     monkeypatch.setattr(reproduce, "run_jobs", counted)
-    assert main(smoke(tmp_path)) == 0
+    assert main(smoke(reproduced)) == 0
     assert ran == []
-    path = tmp_path / "steps" / "evaluate-strokes-strokes-0.json"
+    path = reproduced / "steps" / "evaluate-strokes-strokes-0.json"
     record = json.loads(path.read_text())
-    record["checkpoints"][f"{tmp_path}/strokes/rssm-0"] = "of another training"
+    record["checkpoints"][f"{reproduced}/strokes/rssm-0"] = "of another training"
     path.write_text(json.dumps(record))
 
-    assert main(smoke(tmp_path)) == 0
+    assert main(smoke(reproduced)) == 0
 
     assert ran == ["evaluate-strokes-strokes-0"]
 
 
-def test_what_is_wrong_is_said_in_one_sentence(tiny_plan, tmp_path, capsys):
-    assert main(smoke(tmp_path)) == 0
-
-    other = error_of(capsys, "reproduce", "--budget", "small", "-o", tmp_path)
-    assert other.startswith(f"{tmp_path}: has the runs of --budget smoke, expected small. Choose another folder")
+def test_what_is_wrong_is_said_in_one_sentence(tiny_plan, reproduced, capsys):
+    other = error_of(capsys, "reproduce", "--budget", "small", "-o", reproduced)
+    assert other.startswith(f"{reproduced}: has the runs of --budget smoke, expected small. Choose another folder")
     assert "invalid choice: 'theory'" in error_of(capsys, "reproduce", "--only", "theory")
 
 
@@ -177,7 +206,7 @@ def test_a_dry_run_lists_hours_and_trains_nothing(tiny_plan, tmp_path, capsys):
     lines = capsys.readouterr().out
     assert all(name in lines for name in ("strokes/rssm-0", "strokes/forbes-0"))
     assert "2 of 2 trainings are missing and take about 0.0 hours" in lines
-    assert [*tmp_path.iterdir()] == [tmp_path / "rssm.yaml"]
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_measured_updates_per_second_replace_the_recorded(tiny_plan, tmp_path):

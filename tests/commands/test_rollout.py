@@ -1,13 +1,14 @@
 """`forbes rollout`: the video is of the episodes that `forbes evaluate` measures, in front of a camera if need be."""
 
 import io
+import shutil
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageSequence
-from small_agents import fit, forbes, write_config, write_image_config
+from small_agents import forbes
 from toy_environments import Parrot
 
 from forbes import GaussianBelief, MLPDecoder, MLPEncoder, VectorNormal, WorldModel
@@ -24,11 +25,8 @@ from forbes.training.loading import load_run
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("agent")
-    config = write_image_config(folder)
-    assert fit("--config", config, "--run_dir", folder / "run", "--trainer.max_epochs", 1) == 0
-    return folder / "run"
+def run(small_image_agent, tmp_path_factory):
+    return shutil.copytree(small_image_agent, tmp_path_factory.mktemp("agent") / "run")
 
 
 def test_the_video_shows_the_episodes_that_evaluate_measures(run, tmp_path, capsys):
@@ -55,24 +53,20 @@ def test_the_video_shows_the_episodes_that_evaluate_measures(run, tmp_path, caps
     assert [each.name for each in path.parent.iterdir()] == ["agent.gif"]
 
 
-def test_refuses_what_cannot_be_filmed(run, tiny_run, tmp_path, capsys):
-    vectors = tmp_path / "vectors"
-    assert fit("--config", write_config(tmp_path), "--run_dir", vectors, "--trainer.max_epochs", 1) == 0
-    capsys.readouterr()
-
+def test_refuses_what_cannot_be_filmed(run, small_agent, tiny_run, tmp_path, capsys):
     for arguments, message in [
         ((run, "--video", tmp_path / "agent.avi"), "agent.avi: it ends in .avi, expected .gif or .mp4. Rename it"),
         ((run, "--video", "/proc/agent.gif"), "/proc/"),
         ((run, "--video", tmp_path / "a.gif", "--device", "cuda:9"), "--device cuda:9: it cannot be used"),
         ((tiny_run, "--video", tmp_path / "a.gif"), "not the run of an agent, but of a WorldModel"),
         ((tmp_path / "absent", "--video", tmp_path / "a.gif"), "no such run folder"),
-        ((vectors, "--video", tmp_path / "a.gif"), "the observations are vectors of 2, expected images"),
+        ((small_agent, "--video", tmp_path / "a.gif"), "the observations are vectors of 2, expected images"),
     ]:
         assert forbes("rollout", *arguments) == 2
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
-    assert f"forbes evaluate {vectors}" in error
+    assert f"forbes evaluate {small_agent}" in error
     assert not list(tmp_path.glob("*.gif"))
 
 
@@ -197,10 +191,7 @@ def test_an_environment_that_does_not_render_is_drawn_as_curves(capsys):
     assert "no camera: popgym:popgym-RepeatPreviousEasy-v0: it does not render images" in capsys.readouterr().err
 
 
-def test_an_agent_of_vectors_is_drawn_as_curves(tmp_path):
-    vectors = tmp_path / "vectors"
-    assert fit("--config", write_config(tmp_path), "--run_dir", vectors, "--trainer.max_epochs", 1) == 0
-
-    assert forbes("rollout", vectors, "--video", tmp_path / "a.gif", "--imagine", 3) == 0
+def test_an_agent_of_vectors_is_drawn_as_curves(small_agent, tmp_path):
+    assert forbes("rollout", small_agent, "--video", tmp_path / "a.gif", "--imagine", 3) == 0
 
     assert frames_of(tmp_path / "a.gif").shape == (9, 14 + 256, 384 + 8, 3)

@@ -71,14 +71,6 @@ def test_a_missing_run_or_configuration_is_told_without_torch(tmp_path, argument
     assert not {"torch", "pandas", "matplotlib", "jsonargparse"} & modules
 
 
-def test_the_command_of_a_training_imports_no_pandas():
-    program = "import sys, forbes.commands.fit; print('pandas' in sys.modules)"
-
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-
-    assert done.stdout.strip() == "False"
-
-
 def test_the_model_without_a_trainer_is_that_of_load_run():
     world, data = forbes.load_run(PRETRAINED)
 

@@ -65,43 +65,47 @@ def without(file):
     return lambda run, _: not (Path(run) / file).exists()
 
 
+SAME = [  # what changes no weight: as many at once as Lightning accepts
+    {
+        "accelerator": "cpu",
+        "devices": "1",
+        "strategy": "auto",
+        "num_nodes": "1",
+        "precision": "32-true",
+        "min_epochs": "1",  # of a training that a callback may stop before
+        "min_steps": "1",
+        "max_time": "00:01:00:00",
+        "limit_test_batches": "1",
+        "limit_predict_batches": "1",
+        "num_sanity_val_steps": "0",
+        "deterministic": "warn",
+        "benchmark": "false",
+        "inference_mode": "false",
+        "use_distributed_sampler": "false",  # there is one device
+        "detect_anomaly": "true",
+        "sync_batchnorm": "true",
+        "reload_dataloaders_every_n_epochs": "1",
+        "enable_autolog_hparams": "false",
+    },
+    {"plugins": "TorchSyncBatchNorm"},
+]
 WORKS = [  # each trains two epochs of five updates
-    ("accelerator", "cpu", same),
-    ("devices", "1", same),
-    ("strategy", "auto", same),
-    ("num_nodes", "1", same),
-    ("precision", "32-true", same),
     ("precision", "bf16-mixed", lambda run, plain: not same(run, plain)),
     ("logger", "false", without("metrics.jsonl")),
     ("callbacks", "LearningRateMonitor", lambda run, _: "lr-Adam" in read_metrics(run)),
     ("fast_dev_run", "2", without("checkpoints")),
     ("max_epochs", "1", updates(5)),
-    ("min_epochs", "1", same),  # of a training that a callback may stop before
     ("max_steps", "7", updates(7)),
-    ("min_steps", "1", same),
     ("max_time", "00:00:00:00", without("checkpoints")),
-    ("max_time", "00:01:00:00", same),
     ("limit_train_batches", "3", updates(6)),
     ("limit_train_batches", "0.4", updates(4)),
     ("limit_val_batches", "0", lambda run, _: "val/kl" not in read_metrics(run)),
-    ("limit_test_batches", "1", same),
-    ("limit_predict_batches", "1", same),
     ("overfit_batches", "2", updates(4)),
     ("val_check_interval", "2", validations(2, 4, 7, 9)),
     ("check_val_every_n_epoch", "2", validations(10)),
-    ("num_sanity_val_steps", "0", same),
-    ("log_every_n_steps", "5", logged(5, 10)),
+    ("log_every_n_steps", "7", logged(7)),  # more than an epoch has, of which Lightning warns
     ("enable_checkpointing", "false", without("checkpoints")),
     ("accumulate_grad_batches", "5", updates(2)),
-    ("deterministic", "warn", same),
-    ("benchmark", "false", same),
-    ("inference_mode", "false", same),
-    ("use_distributed_sampler", "false", same),  # there is one device
-    ("detect_anomaly", "true", same),
-    ("plugins", "TorchSyncBatchNorm", same),
-    ("sync_batchnorm", "true", same),
-    ("reload_dataloaders_every_n_epochs", "1", same),
-    ("enable_autolog_hparams", "false", same),
 ]
 PRINTS = [
     ("enable_progress_bar", "true", "epoch 2/2"),
@@ -113,7 +117,7 @@ PRINTS = [
 def test_the_lists_have_every_argument_of_the_trainer():
     listed = {argument for argument, *_ in (*REFUSED, *REFUSED_BY_LIGHTNING, *WORKS, *PRINTS)}
 
-    assert listed == set(inspect.signature(Trainer).parameters)
+    assert listed.union(*SAME) == set(inspect.signature(Trainer).parameters)
 
 
 @pytest.mark.parametrize(("argument", "value", "sentence"), REFUSED)
@@ -140,20 +144,42 @@ def test_what_is_accepted_does_what_it_says(argument, value, holds, tiny_config,
 
     assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run), f"--trainer.{argument}", value]) == 0
 
-    torch.use_deterministic_algorithms(False)
     assert holds(run, tiny_run)
     assert not [warning for warning in recwarn if "lightning" in warning.filename]
 
 
-@pytest.mark.parametrize(("argument", "value", "text"), PRINTS)
-def test_what_is_to_be_printed_is_printed(argument, value, text, tiny_config, in_tmp_path, capsys):
-    logger = logging.getLogger("lightning.pytorch")
-    handler = logging.StreamHandler(sys.stdout)  # Lightning's own writes to what stderr was when it was imported
-    logger.addHandler(handler)
+@pytest.fixture
+def any_algorithm():
+    """Allow them again, after `deterministic`."""
+    yield
+    torch.use_deterministic_algorithms(False)
 
+
+@pytest.mark.parametrize("arguments", SAME)
+def test_what_does_not_concern_the_updates_changes_no_weight(
+    arguments, tiny_config, tiny_run, tmp_path, recwarn, any_algorithm
+):
+    flags = [f"--trainer.{argument}={value}" for argument, value in arguments.items()]
+
+    assert main(["fit", "--config", str(tiny_config), "--run_dir", str(tmp_path / "run"), *flags]) == 0
+
+    assert same(tmp_path / "run", tiny_run)
+    assert not [warning for warning in recwarn if "lightning" in warning.filename]
+
+
+@pytest.fixture
+def logged_to_stdout(capsys):
+    """Lightning's own handler writes to what stderr was when it was imported."""
+    handler = logging.StreamHandler(sys.stdout)
+    logging.getLogger("lightning.pytorch").addHandler(handler)
+    yield
+    logging.getLogger("lightning.pytorch").removeHandler(handler)
+
+
+@pytest.mark.parametrize(("argument", "value", "text"), PRINTS)
+def test_what_is_to_be_printed_is_printed(argument, value, text, tiny_config, in_tmp_path, capsys, logged_to_stdout):
     assert main(["fit", "--config", str(tiny_config), f"--trainer.{argument}", value]) == 0
 
-    logger.removeHandler(handler)
     assert text in capsys.readouterr().out
 
 

@@ -1,6 +1,7 @@
 """The DeepMind Control Suite: the same seed is the same episode, and a step is what the suite itself says."""
 
 from functools import partial
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -26,10 +27,13 @@ def same(one, other):
     return all(np.array_equal(a.observation, b.observation) and a[1:] == b[1:] for a, b in pairs)
 
 
-@pytest.mark.parametrize(("domain", "name"), suite.BENCHMARKING)
-def test_a_seed_is_an_episode_whatever_was_played_before(domain, name):
-    environment = DeepMindControl(f"{domain}_{name}", pixels=False)
+@pytest.fixture(scope="module", params=suite.BENCHMARKING, ids="_".join)
+def environment(request):
+    """Each task of the suite, built once."""
+    return DeepMindControl("_".join(request.param), pixels=False)
 
+
+def test_a_seed_is_an_episode_whatever_was_played_before(environment):
     first = play(environment, seed=5, steps=4)
     other = play(environment, seed=6, steps=4)
     again = play(environment, seed=5, steps=4)
@@ -38,6 +42,15 @@ def test_a_seed_is_an_episode_whatever_was_played_before(domain, name):
     assert not same(first, other)
     assert all(np.isfinite(step.observation).all() and np.isfinite(step.reward) for step in first)
     assert first[0].observation.shape == environment.observation_shape
+
+
+def test_every_task_names_all_its_dimensions(environment):
+    parts = environment.named_parts()
+    velocities = parts.pop("velocities")
+
+    (size,) = environment.observation_shape
+    assert [*chain(*parts.values())] == list(range(size))
+    assert 0 < len(velocities) < size
 
 
 @pytest.mark.parametrize("action_repeat", [1, 3])

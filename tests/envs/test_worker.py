@@ -70,7 +70,7 @@ def test_the_shorter_of_two_time_limits_is_told(limit, expected):
 
 SENTENCES = {
     "raises": "step raises ArithmeticError: the physics has exploded",
-    "hangs": "it hangs, no answer to step within 2 s",
+    "hangs": "it hangs, no answer to step within 0.5 s",
     "dies": "its process died in step, exit code -9",
     "leaves": "its process died in step, exit code 7",
     "rewards_nan": "step raises ValueError: the reward is nan, expected a finite number",
@@ -83,7 +83,7 @@ SENTENCES = {
 @pytest.mark.parametrize("trouble", SENTENCES)
 def test_after_trouble_the_next_reset_starts_anew(trouble, tmp_path):
     make = partial(Troubled, trouble, tmp_path / "ledger")
-    with EnvironmentProcess(make, timeout=2.0 if trouble == "hangs" else 60.0) as environment:
+    with EnvironmentProcess(make, timeout=0.5 if trouble == "hangs" else 60.0) as environment:
         first = environment.describe()["process"]
         with pytest.raises(BrokenEnvironmentError) as error:
             episode(environment)
@@ -100,14 +100,15 @@ def test_after_trouble_the_next_reset_starts_anew(trouble, tmp_path):
 @pytest.mark.parametrize("trouble", ["raises", "hangs", "leaves"])
 def test_early_trouble_is_one_sentence_and_leaves_no_process(where, trouble, monkeypatch):
     monkeypatch.setattr(worker, "START_LIMIT", 3.0 if (where, trouble) == ("start", "hangs") else 60.0)
+    limit = 3 if where == "start" else 0.5
     begun = set(multiprocessing.active_children())
 
     with pytest.raises(BrokenEnvironmentError) as error:
-        EnvironmentProcess(partial(Unready, where, trouble), timeout=3.0).reset(0)
+        EnvironmentProcess(partial(Unready, where, trouble), timeout=0.5).reset(0)
 
     sentences = {
         "raises": f"{where} raises ArithmeticError: the physics has exploded",
-        "hangs": f"it hangs, no answer to {where} within 3 s",
+        "hangs": f"it hangs, no answer to {where} within {limit} s",
         "leaves": f"its process died in {where}, exit code 7",
     }
     assert str(error.value).startswith(f"{'Unready' if where == 'start' else 'Echo'}: {sentences[trouble]}")

@@ -161,6 +161,11 @@ class OtherUnits(Normalised):
         return observation.float() / 255
 
 
+def test_a_model_that_sees_ahead_is_not_scored_in_python_either():
+    with pytest.raises(ForbesError, match="Smoother: the belief after 1 of 6 steps depends on later observations"):
+        forbes.evaluate(Smoother().eval(), DATA, ["elbo"], sequences=2)
+
+
 @pytest.mark.parametrize("kind", [Right, Draws])
 def test_a_right_adapter_passes(kind):
     check_model(kind().eval(), DATA, "mine")

@@ -16,10 +16,8 @@ NAME = "return[episodes=3]"
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("agent")
-    assert fit("--config", write_config(folder), "--run_dir", folder / "run", "--trainer.max_epochs", 1) == 0
-    return folder / "run"
+def run(small_agent, tmp_path_factory):
+    return shutil.copytree(small_agent, tmp_path_factory.mktemp("agent") / "run")
 
 
 def test_the_return_is_what_the_agent_earns_without_exploration(run, capsys):

@@ -5,7 +5,7 @@ import torch
 
 from forbes.data import SequenceBatch, SequenceDataModule, SequenceSource, Simulated, Strokes
 from forbes.evaluation.references import references
-from forbes.models import Bernoulli, Normal, OnePixel, VectorNormal
+from forbes.models import Bernoulli, Likelihood, Normal, OnePixel, VectorNormal
 from forbes.pomdps import LinearGaussian
 
 
@@ -77,6 +77,14 @@ def test_a_density_of_strokes_is_not_held_against_n_grams(strokes_file):
     data = SequenceDataModule(Strokes(path=str(strokes_file), validation=20, frames="whole"), length=6)
 
     assert [*references(data, Normal(std=0.5), "test", 12)] == ["mean frame", "last frame"]
+
+
+def test_n_grams_are_of_the_two_likelihoods_of_binary_pixels(strokes_file):
+    own = type("Own", (Likelihood,), {name: lambda *_: None for name in Likelihood.__abstractmethods__})()
+    data = SequenceDataModule(Strokes(path=str(strokes_file), validation=20), length=6)
+
+    assert references(data, Bernoulli(), "test", 4)
+    assert references(data, own, "test", 4) == {}
 
 
 def test_images_are_held_against_still_pictures():

@@ -1,9 +1,11 @@
 """Reward prediction of a world model: exact for models that know everything, or only the mean."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
-from small_agents import fit, forbes, write_config
+from small_agents import forbes
 from torch import nn
 
 from forbes.data.episodes.episode import Episode
@@ -102,8 +104,8 @@ def test_a_predicted_reward_that_is_not_finite_is_an_error():
         predict_rewards(Walk(lambda place: place / 0), walk(6), 0, "run, test episode 7")
 
 
-def test_a_measurement_is_recorded_and_repeated(tmp_path, capsys):
-    assert fit("--config", write_config(tmp_path), "--run_dir", tmp_path / "run", "--trainer.max_epochs", 1) == 0
+def test_a_measurement_is_recorded_and_repeated(small_agent, tmp_path, capsys):
+    shutil.copytree(small_agent, tmp_path / "run")
     names = [f"reward_explained[ahead={distance},S=16,episodes=3]" for distance in (0, 1, 5)]
 
     assert forbes("evaluate", tmp_path / "run", "--episodes", 3) == 0

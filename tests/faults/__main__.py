@@ -45,6 +45,7 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=3000, help="damaged inputs of each reader (3000)")
     parser.add_argument("--starts", type=int, default=1000, help="starts of an environment's process (1000)")
     parser.add_argument("--epochs", type=int, default=300, help="epochs of the long agent (300)")
+    parser.add_argument("--short", action="store_true", help="without what other tests and other groups repeat")
     parser.add_argument("--processes", type=int, default=os.cpu_count(), help="at once (one for each core)")
     parser.add_argument("--only", default="", help="groups whose promise has this in it")
     parser.add_argument("--report", type=Path, help="write the table to this file")
@@ -87,6 +88,7 @@ def _groups(folder: Path, options: argparse.Namespace) -> Iterator[Group]:
     shares |= {starting: 0.06, comparison: 0.04}
     wholes = {scenario: scenario.straight(folder / "whole" / scenario.name) for scenario in shares}
     chunks = [(n, min(CHUNK, options.inputs - n)) for n in range(0, options.inputs, CHUNK)]
+    read = [] if options.short else chunks  # tests/test_damaged_files.py reads the same kinds
     for scenario, share in shares.items():
         faults = kills.injections(wholes[scenario], max(1, round(share * options.kills)))
         strike = functools.partial(kills.strike, scenario, wholes[scenario].result)
@@ -96,7 +98,8 @@ def _groups(folder: Path, options: argparse.Namespace) -> Iterator[Group]:
             "at random",
             [functools.partial(strike, folder / scenario.name / str(n), fault) for n, fault in enumerate(faults)],
         )
-    for scenario in (strokes, acting, overlapping, evaluation, collection):
+    writers = [strokes, acting, evaluation] if options.short else [strokes, acting, overlapping, evaluation]
+    for scenario in (*writers, collection):  # of an agent with overlap, too, the parent alone writes
         place, whole = folder / f"without {scenario.name}", wholes[scenario].result
         yield Group(
             f"{scenario.name}: on a full disk it ends with one sentence, and nothing is lost",
@@ -124,7 +127,7 @@ def _groups(folder: Path, options: argparse.Namespace) -> Iterator[Group]:
         "one that goes back by an hour at each look",
         [
             functools.partial(resources.backwards, each, wholes[each].result, folder / f"clock of {each.name}")
-            for each in (strokes, acting, overlapping, evaluation)
+            for each in writers
         ],
     )
     yield Group(
@@ -139,7 +142,7 @@ def _groups(folder: Path, options: argparse.Namespace) -> Iterator[Group]:
     yield Group(
         "a damaged file is read, or named in one sentence",
         f"{', '.join(kind.name for kind in KINDS)}: bits flipped, bytes cut out, cut off, repeated, put in",
-        [functools.partial(fuzz.reader, kind, number, seed) for kind in KINDS for seed, number in chunks],
+        [functools.partial(fuzz.reader, kind, number, seed) for kind in KINDS for seed, number in read],
     )
     yield Group(
         "a configuration trains, or is refused in one sentence, and writes nowhere else",

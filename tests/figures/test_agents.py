@@ -10,7 +10,6 @@ import pytest
 from dm_control import suite
 from matplotlib.colors import to_hex
 from recorded_runs import write_agent, write_run
-from small_agents import fit, write_config
 
 from forbes.commands.cli import main
 from forbes.envs.dm_control import DOMAINS
@@ -271,12 +270,8 @@ def test_one_agent_is_not_summarised(agents, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_a_run_that_was_trained_is_drawn(tmp_path, capsys):
-    run = tmp_path / "forbes-0"
-    assert fit("--config", write_config(tmp_path), "--run_dir", run) == 0
-    capsys.readouterr()
-
-    assert main(["figures", "returns", "--runs", str(run), "-o", str(tmp_path / "figures")]) == 0
+def test_a_run_that_was_trained_is_drawn(small_agent, tmp_path, capsys):
+    assert main(["figures", "returns", "--runs", str(small_agent), "-o", str(tmp_path / "figures")]) == 0
 
     assert capsys.readouterr().out.split() == [str(tmp_path / f"figures/returns.{kind}") for kind in ("png", "pdf")]
 

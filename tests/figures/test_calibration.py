@@ -4,7 +4,6 @@ import pytest
 import torch
 from command_line import error_of
 
-from forbes.commands.cli import main
 from forbes.errors import ForbesError
 from forbes.figures.calibration import RankedBelief, calibration, draw_calibration
 from forbes.figures.style import BLUE, METHODS, ORANGE, Method, save_figure
@@ -105,22 +104,15 @@ def test_beliefs_about_other_states_are_not_compared():
         calibration(beliefs, SAMPLES)
 
 
-def test_runs_of_a_family_share_a_style_and_one_entry(tiny_run, tiny_config, tmp_path):
-    other = str(tmp_path / "forbes-1")
-    assert main(["fit", "--config", str(tiny_config), "--run_dir", other, "--seed_everything", "1"]) == 0
-
-    figure = draw_calibration([str(tiny_run), other])["calibration"]
+def test_runs_of_a_family_share_a_style_and_one_entry(tiny_run, tiny_forbes1):
+    figure = draw_calibration([str(tiny_run), str(tiny_forbes1)])["calibration"]
 
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["FORBES, 2 runs", "calibrated, 95 %"]
     assert len(lines_of(figure.axes[2], METHODS["FORBES"].colour)) == 2
 
 
-def test_a_model_without_a_state_is_not_calibrated(tiny_config, tmp_path, capsys):
-    run = tmp_path / "vector-0"
-    vector = ["--model.model", "VectorModel", "--model.state_dim", "0"]
-    assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run), *vector]) == 0
+def test_a_model_without_a_state_is_not_calibrated(tiny_vector, tmp_path, capsys):
+    sentence = error_of(capsys, "figures", "calibration", "--runs", tiny_vector, "-o", tmp_path / "figures")
 
-    sentence = error_of(capsys, "figures", "calibration", "--runs", run, "-o", tmp_path / "figures")
-
-    assert sentence == f"{run}: a Vector model has no state that could be ranked. Name other runs"
+    assert sentence == f"{tiny_vector}: a Vector model has no state that could be ranked. Name other runs"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from small_agents import fit, forbes, write_config, write_image_config
+from small_agents import forbes
 
 from forbes.commands.cli import main
 from forbes.evaluation.runs import load_runs
@@ -12,17 +12,9 @@ from forbes.figures.reconstructions import draw_reconstructions
 
 
 @pytest.fixture(scope="module")
-def runs(tiny_run, tiny_config, tmp_path_factory):
+def runs(tiny_run, tiny_rssm, tiny_vector):
     """FORBES, an RSSM and a model without a state on the same digits of 6 steps."""
-    folder = tmp_path_factory.mktemp("reconstructed")
-    made = [str(tiny_run)]
-    for name, flags in {
-        "rssm": ["--model.belief", "GaussianBelief"],
-        "vector": ["--model.model", "VectorModel", "--model.state_dim", "0"],
-    }.items():
-        assert main(["fit", "--config", str(tiny_config), "--run_dir", str(folder / name), *flags]) == 0
-        made.append(str(folder / name))
-    return made
+    return [str(tiny_run), str(tiny_rssm), str(tiny_vector)]
 
 
 def rows(figure):
@@ -63,22 +55,14 @@ def test_predictions_begin_after_the_context(runs):
     assert reconstructed.all()
 
 
-@pytest.fixture(scope="module")
-def agent(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("agent")
-    run = folder / "forbes-0"
-    assert fit("--config", write_image_config(folder), "--trainer.max_epochs", 1, "--run_dir", run) == 0
-    return run
-
-
-def test_an_agent_is_drawn_on_its_newest_episode(agent, tmp_path, capsys):
-    assert forbes("figures", "reconstructions", "--runs", agent, "--context", 2, "-o", tmp_path) == 0
+def test_an_agent_is_drawn_on_its_newest_episode(small_image_agent, tmp_path, capsys):
+    assert forbes("figures", "reconstructions", "--runs", small_image_agent, "--context", 2, "-o", tmp_path) == 0
 
     assert {path.name for path in tmp_path.iterdir()} == {"reconstructions.png", "reconstructions.pdf"}
 
 
-def test_models_of_other_data_have_a_figure_of_their_own(agent, runs):
-    names = list(draw_reconstructions([str(agent), runs[0]], context=2))
+def test_models_of_other_data_have_a_figure_of_their_own(small_image_agent, runs):
+    names = list(draw_reconstructions([str(small_image_agent), runs[0]], context=2))
 
     assert names == ["reconstructions-Slide", "reconstructions-strokes"]
 
@@ -95,8 +79,6 @@ def test_what_does_not_fit_is_one_sentence(flags, sentence, runs, tmp_path, caps
     assert sentence in capsys.readouterr().err
 
 
-def test_vectors_are_no_frames(tmp_path, capsys):
-    assert fit("--config", write_config(tmp_path), "--trainer.max_epochs", 1, "--run_dir", tmp_path / "run") == 0
-
-    assert forbes("figures", "reconstructions", "--runs", tmp_path / "run", "-o", tmp_path) == 2
+def test_vectors_are_no_frames(small_agent, tmp_path, capsys):
+    assert forbes("figures", "reconstructions", "--runs", small_agent, "-o", tmp_path) == 2
     assert "the observations are vectors of 2, expected images" in capsys.readouterr().err

@@ -9,7 +9,6 @@ import pytest
 from command_line import error_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from forbes.commands.cli import main
 from forbes.evaluation.runs import load_runs
 from forbes.figures.catalogue import draw
 from forbes.figures.scores import draw_per_step, draw_prequential
@@ -17,12 +16,9 @@ from forbes.figures.style import METHODS
 
 
 @pytest.fixture(scope="module")
-def trained(tiny_run, tiny_config, tmp_path_factory):
+def trained(tiny_run, tiny_rssm):
     """An RSSM next to FORBES."""
-    run = tmp_path_factory.mktemp("scores") / "rssm"
-    rssm = ["--model.init_args.belief", "GaussianBelief"]
-    assert main(["fit", "--config", str(tiny_config), "--run_dir", str(run), *rssm]) == 0
-    return str(tiny_run), str(run)
+    return str(tiny_run), str(tiny_rssm)
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import pytest
 import torch
 from command_line import error_of
 
-from forbes.commands.cli import main
 from forbes.data import SequenceDataModule, Strokes
 from forbes.data.strokes.classifiers import load_classifiers
 from forbes.evaluation.digits import completions
@@ -16,12 +15,9 @@ from forbes.figures.simcore import count_changes, draw_simcore, read_digits
 
 
 @pytest.fixture(scope="module")
-def runs(tiny_run, tiny_config, tmp_path_factory):
+def runs(tiny_run, tiny_vector):
     """FORBES, and a model without a state, on the same digits."""
-    vector = str(tmp_path_factory.mktemp("simcore") / "vector")
-    flags = ["--model.model", "VectorModel", "--model.state_dim", "0"]
-    assert main(["fit", "--config", str(tiny_config), "--run_dir", vector, *flags]) == 0
-    return [vector, str(tiny_run)]
+    return [str(tiny_vector), str(tiny_run)]
 
 
 @pytest.fixture(scope="module")

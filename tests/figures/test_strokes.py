@@ -23,17 +23,11 @@ from forbes.figures.predictions import ambiguous_digits
 from forbes.figures.style import BLACK, BLUE, METHODS, ORANGE, draw_references, paper_style, save_figure
 from forbes.runs.folder import read_metrics
 
-RSSM = ["--model.init_args.belief", "GaussianBelief"]
-
 
 @pytest.fixture(scope="module")
-def runs(tiny_run, tiny_config, tmp_path_factory):
+def runs(tiny_run, tiny_forbes1, tiny_rssm):
     """FORBES with two seeds and RSSM with one."""
-    folder = tmp_path_factory.mktemp("figures")
-    fit = ["fit", "--config", str(tiny_config), "--run_dir"]
-    assert main([*fit, str(folder / "rssm"), *RSSM]) == 0
-    assert main([*fit, str(folder / "forbes1"), "--seed_everything", "1"]) == 0
-    return [str(tiny_run), str(folder / "forbes1"), str(folder / "rssm")]
+    return [str(tiny_run), str(tiny_forbes1), str(tiny_rssm)]
 
 
 def draw(runs, output, *arguments):
@@ -133,11 +127,8 @@ def test_a_reference_far_above_the_curves_is_written():
     assert axes.get_xlim() == (-5.0, -3.0)
 
 
-def test_families_of_other_bounds_are_drawn_by_their_own(runs, tiny_config, tmp_path):
-    particle, vector = (str(tmp_path / name) for name in ("particle", "vector"))
-    fit = ["fit", "--config", str(tiny_config), "--run_dir"]
-    assert main([*fit, particle, *RSSM, "--model.model", "ParticleModel", "--model.model.particles", "2"]) == 0
-    assert main([*fit, vector, "--model.model", "VectorModel", "--model.state_dim", "0"]) == 0
+def test_families_of_other_bounds_are_drawn_by_their_own(runs, tiny_particle, tiny_vector, tmp_path):
+    particle, vector = (str(shutil.copytree(run, tmp_path / run.name)) for run in (tiny_particle, tiny_vector))
     for run, metric in [(particle, "test/elbo[bernoulli,S=16]"), (vector, "test/pll[bernoulli,K=128]")]:
         (tmp_path / run / "evaluation.json").write_text(json.dumps({metric: {"mean": -90.0}}))
 

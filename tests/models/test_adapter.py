@@ -254,6 +254,12 @@ def test_an_adapter_without_a_roll_out_or_draws_is_refused(name, missing):
         type("Half", (ModelAdapter,), methods)()
 
 
+def test_a_filter_of_an_adapter_starts_at_the_start():
+    adapter = Draws(random_model("gaussian"))
+    with pytest.raises(ForbesError, match=r"starts at `initial`, found a start\. Call `observe`"):
+        adapter.filter(torch.zeros(2, 3, 1), torch.zeros(2, 3, 0), adapter.initial(2))
+
+
 def test_an_adapter_is_not_trained():
     with pytest.raises(ForbesError, match="Draws: an adapter is scored, not trained"):
         Draws(random_model("gaussian")).lower_bound(*sequences())

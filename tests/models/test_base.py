@@ -210,21 +210,23 @@ def test_a_saved_and_loaded_model_gives_identical_outputs(kind, tmp_path):
     torch.testing.assert_close(results[0], results[1], rtol=0, atol=0)
 
 
-# The soft particles have a flow, whose time would be spent for what the others show.
-@pytest.mark.parametrize("kind", [kind for kind in MODELS if kind != "soft particles"])
+# One of each kind of state: `test_gradients_reach_every_parameter` has them all.
+@pytest.mark.parametrize("kind", ["gaussian", "flow", "categorical", "vector"])
 def test_overfits_one_batch(kind):
     """A random pixel costs 0.69 nats until it is remembered, then what it takes to say which of the five sequences."""
     model, batch = make_model(kind, width=64), sequences()
     optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
     torch.manual_seed(0)
+    mean_frame = torch.distributions.Bernoulli(batch[0].double().mean(0))
+    untold = mean_frame.entropy().sum().item() / TIME  # the least that a model pays which cannot tell them apart
 
     bounds = []
-    for _ in range(300):
+    for _ in range(250):
         terms = model.lower_bound(*batch)
         optimizer.zero_grad()
         elbo_loss(terms).backward()
         optimizer.step()
         bounds.append(terms.elbo.mean().item() / TIME)
 
-    assert bounds[0] < -20
-    assert sum(bounds[-20:]) / 20 > bounds[0] / 3
+    assert bounds[0] < -untold
+    assert sum(bounds[-20:]) / 20 > -untold / 2

@@ -64,7 +64,7 @@ def test_one_pixel_draws_what_it_gives_probability_to():
     ("likelihood", "observation", "message"),
     [
         (OnePixel(), torch.ones(2, 1, 3, 3, dtype=torch.uint8), "a frame has 9 pixels that are on, expected at most 1"),
-        (OnePixel(), torch.full((2, 1, 1, 1), 255, dtype=torch.uint8), "values from 255 to 255, expected 0 and 1"),
+        (OnePixel(), torch.full((2, 1, 1, 1), 255, dtype=torch.uint8), "OnePixel: observations have values from 255"),
         (Bernoulli(), torch.full((2, 1, 1, 1), 7, dtype=torch.uint8), "values from 7 to 7, expected 0 and 1"),
         (Bernoulli(), torch.full((2, 1, 1, 1), -1.0), "values from -1 to -1, expected 0 and 1"),
         (Bernoulli(), torch.full((2, 1, 1, 1), torch.nan), "values from nan to nan, expected 0 and 1"),

@@ -1,6 +1,6 @@
 """Encoders and decoders: the sizes their documentation gives, each image on its own."""
 
-from functools import reduce
+from functools import partial, reduce
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from forbes.errors import ForbesError
-from forbes.models import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder
+from forbes.models import ConvDecoder, ConvEncoder, MLPDecoder, MLPEncoder, PixelDecoder, PixelEncoder
 from forbes.models.networks import MLP, activate, transposed_kernels
 
 
@@ -144,3 +144,20 @@ def test_convolutions_are_not_for_vectors_or_specks(network, sizes, shape):
         ForbesError, match=rf"{network.__name__}: found .* \({shape[0]},.*\), .* Use MLP.*coder as model\..*coder$"
     ):
         network(*sizes, shape)
+
+
+@pytest.mark.parametrize(
+    ("make", "argument"),
+    [
+        (partial(MLPEncoder, (3,)), "layers"),
+        (partial(MLPEncoder, (3,)), "width"),
+        (partial(MLPDecoder, 5, (3,)), "layers"),
+        (partial(ConvEncoder, (1, 16, 16)), "channels"),
+        (partial(ConvDecoder, 5, (1, 16, 16)), "channels"),
+        (partial(PixelEncoder, (1, 8, 8)), "width"),
+        (partial(PixelDecoder, 5, (1, 8, 8)), "width"),
+    ],
+)
+def test_a_network_of_no_size_is_refused(make, argument):
+    with pytest.raises(ForbesError, match=rf"^{make.func.__name__}: {argument} is 0, expected at least 1"):
+        make(**{argument: 0})

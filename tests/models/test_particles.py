@@ -10,8 +10,9 @@ from small_models import random_model, sequences
 
 from forbes.beliefs import GaussianBelief
 from forbes.errors import ForbesError
-from forbes.models import ModelParts, ParticleModel, StateSpaceModel
+from forbes.models import ConvDecoder, ConvEncoder, ModelParts, ParticleModel, StateSpaceModel
 from forbes.models.particles import effective_sample_size, run_particles, soft, systematic, systematic_resampling
+from forbes.training import WorldModel
 
 ROUNDING = 1e-4  # of float32, in nats or units of the state
 RESAMPLING = {"systematic": systematic, "soft": soft}
@@ -241,6 +242,27 @@ def test_hidden_and_stochastic_states_are_redrawn_together():
     assert same.any(1).all()
     assert (effective_sample_size(before.log_weight) < 1.5).all()
     assert not same.diagonal(dim1=0, dim2=1).all()
+
+
+def test_images_of_many_frames_have_the_reparameterised_gradient():
+    """They are decoded from one pixel by a product, here with frozen weights."""
+    world = WorldModel(
+        observation_shape=(1, 16, 16),
+        belief=GaussianBelief,
+        model=partial(ParticleModel, particles=3),
+        encoder=partial(ConvEncoder, channels=2),
+        decoder=partial(ConvDecoder, channels=2),
+        kl="path",
+        state_dim=2,
+        hidden_dim=4,
+        mlp_dim=4,
+    )
+    observation = torch.randint(2, (2, 6, 1, 16, 16), dtype=torch.uint8)
+    mask = torch.ones(2, 6, dtype=torch.bool)
+
+    world.model.lower_bound(observation, torch.zeros(2, 6, 0), mask, kl="path").elbo.sum().backward()
+
+    assert all(parameter.grad.isfinite().all() for parameter in world.model.decoder.parameters())
 
 
 def test_what_cannot_be_is_said_in_one_sentence():

@@ -7,6 +7,7 @@ import torch
 from small_models import (
     BATCH,
     HIDDEN,
+    PARTS,
     SHAPE,
     STATE,
     STATE_SPACE,
@@ -143,9 +144,10 @@ def test_how_the_kl_is_differentiated_changes_no_value(family):
         *((family, "path") for family in ("gaussian", "flow", "mixture", "particles", "soft particles")),
     ],
 )
-def test_the_gradient_of_the_bound_is_the_same_on_average(family, kl):
+def test_the_gradient_of_the_bound_is_the_same_on_average(family, kl, monkeypatch):
     """Against the plain gradient, with the same noise: what is left out has mean 0."""
-    model, (observation, action, mask), number = random_model(family), sequences(), 400
+    monkeypatch.setitem(PARTS, "soft particles", {})  # a Gaussian belief: the flow has a case of its own
+    model, (observation, action, mask), number = random_model(family), sequences(), 30
     parameters = list(model.parameters())
 
     def gradient(kl, seed):
@@ -154,15 +156,16 @@ def test_the_gradient_of_the_bound_is_the_same_on_average(family, kl):
             [g.flatten() for g in torch.autograd.grad(elbo_loss(model.lower_bound(*batch, kl)), parameters)]
         )
 
-    batch = (observation[:2, :3].repeat(8, 1, 1, 1, 1), action[:2, :3].repeat(8, 1, 1), mask[:2, :3].repeat(8, 1))
+    # 128 draws in a batch cost less than 128 batches.
+    batch = (observation[:2, :3].repeat(128, 1, 1, 1, 1), action[:2, :3].repeat(128, 1, 1), mask[:2, :3].repeat(128, 1))
     plain, other = (torch.stack([gradient(each, seed) for seed in range(number)]) for each in ("monte_carlo", kl))
 
     difference = other - plain  # (number, parameters)
     error = difference.std(0) / number**0.5
     moved = error > 1e-9
-    # |t| exceeds 6 with probability 3e-9, of some thousand parameters with 1e-5.
-    assert (difference.mean(0)[moved] / error[moved]).abs().max() < 6
-    assert (other.mean(0)[moved] / error[moved]).abs().max() > 12  # a gradient off by a half would be seen
+    # Student's |t| of 29 degrees of freedom exceeds 7 with probability 1e-7, in one of 6,000 parameters with 6e-4.
+    assert (difference.mean(0)[moved] / error[moved]).abs().max() < 7
+    assert (other.mean(0)[moved] / error[moved]).abs().max() > 14  # a gradient off by a half would be seen
     assert moved.sum() > 50
 
 

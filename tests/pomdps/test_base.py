@@ -46,9 +46,12 @@ def draw(process, sequences, length, seed=0):
 
 
 def assert_mean_is_zero(values):
-    """Within 4 standard errors, values `(N, ...)` independent over N."""
+    """Within 5 standard errors, values `(N, ...)` independent over N.
+
+    A mean of 0 exceeds them with probability 6e-7, one of the 500 comparisons of this file with 3e-4.
+    """
     values = values.reshape(len(values), -1)  # (N, M)
-    assert (values.mean(0).abs() <= 4 * values.std(0) / math.sqrt(len(values)) + 1e-12).all()
+    assert (values.mean(0).abs() <= 5 * values.std(0) / math.sqrt(len(values)) + 1e-12).all()
 
 
 def test_trajectories_have_the_dimensions_of_the_process(process):

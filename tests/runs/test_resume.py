@@ -142,8 +142,9 @@ def test_a_signal_stops_a_training_where_it_can_go_on(
     assert status == 128 + number
     assert read_checkpoint(RunFolder(run).checkpoint)["global_step"] == stops_at
     assert f"stopped at update {stops_at}, resume with: forbes fit --resume {run}" in capsys.readouterr().out
-    assert main(["fit", "--resume", run]) == 0
-    assert_same_run(run, straight)
+    if number == signal.SIGTERM:  # what the others leave is the same
+        assert main(["fit", "--resume", run]) == 0
+        assert_same_run(run, straight)
 
 
 def terminate(*_: object) -> None:

@@ -6,6 +6,7 @@ import shutil
 import typing
 from argparse import ArgumentError
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,7 @@ def descendants(kind):
         yield from descendants(child)
 
 
+@cache
 def reachable_types():
     """List the types of all parameters that a YAML can reach: of the trainer, the model, the data and all in them."""
     types, seen = {}, set()
@@ -52,16 +54,18 @@ def reachable_types():
         for kind in sorted(ours, key=str):
             if not issubclass(kind, BaseException):
                 pending += [each.annotation for each in get_signature_parameters(kind)]
-    return dict(sorted(types.items()))  # every worker collects the same tests
+    return types
 
 
-TYPES = reachable_types()
-
-
-def build(hint, value):
-    """Do what `forbes` does with a part of a configuration."""
+def parser_of(hint):
+    """Make a parser of one part of a configuration, as `forbes` has it."""
     parser = ArgumentParser(exit_on_error=False)
     parser.add_argument("--part", type=hint)
+    return parser
+
+
+def build(parser, value):
+    """Do what `forbes` does with a part of a configuration."""
     parsed = parser.parse_object({"part": value})
     require_classes(parsed)
     return parser.instantiate(parsed).part
@@ -97,23 +101,36 @@ def attacks(mark):
 
 
 def test_the_types_that_a_yaml_reaches_are_many():
-    assert {"Callable", "Any", "list", "dict"} <= {word for name in TYPES for word in name.replace("[", ".").split(".")}
-    assert len(TYPES) > 150
+    words = {word for name in reachable_types() for word in name.replace("[", ".").split(".")}
+
+    assert {"Callable", "Any", "list", "dict"} <= words
+    assert len(reachable_types()) > 150
 
 
-@pytest.mark.parametrize("hint", TYPES.values(), ids=TYPES.keys())
-def test_no_parameter_calls_a_function_of_the_yaml(hint, mark, spy):
+def test_no_parameter_calls_a_function_of_the_yaml(mark, spy):
     allow_modules()
-    kinds = [kind for kind in classes_in(hint) if str(kind.__module__).startswith(TRUSTED)]
-    for returned in [inspect.Signature.empty, *kinds]:
-        spy.__annotations__["return"] = returned
-        for attack in attacks(mark):
-            for value in (attack, [attack], {"key": attack}, attack["class_path"]):
-                try:
-                    build(hint, value)
-                except (ArgumentError, ForbesError, TypeError, ValueError):
-                    pass
-                assert not mark.exists()
+    called, tried = [], 0
+    for name, hint in reachable_types().items():
+        try:
+            parser = parser_of(hint)
+        except ValueError:  # a type that jsonargparse does not support
+            continue
+        tried += 1
+        kinds = [kind for kind in classes_in(hint) if str(kind.__module__).startswith(TRUSTED)]
+        for returned in [inspect.Signature.empty, *kinds]:
+            spy.__annotations__["return"] = returned
+            for attack in attacks(mark):
+                for value in (attack, [attack], {"key": attack}, attack["class_path"]):
+                    try:
+                        build(parser, value)
+                    except (ArgumentError, ForbesError, TypeError, ValueError):
+                        pass
+                    if mark.exists():
+                        called.append((name, value))
+                        mark.unlink()
+
+    assert not called
+    assert tried > 150
 
 
 @pytest.mark.parametrize(("number", "place"), [*enumerate(["encoder", "decoder", "belief", "prior", "model"])])
@@ -181,7 +198,7 @@ def test_the_classes_of_lightning_are_named_as_before(argument, value):
     allow_modules()
     (hint,) = [each.annotation for each in get_signature_parameters(Trainer) if each.name == argument]
 
-    built = build(hint, value)
+    built = build(parser_of(hint), value)
 
     spec = value[0] if isinstance(value, list) else value
     (made,) = built if isinstance(built, list) else [built]
@@ -201,12 +218,14 @@ def test_your_own_module_gives_classes_and_functions_by_name(in_tmp_path, monkey
     allow_modules(["of_mine"])
     (hint,) = [each.annotation for each in get_signature_parameters(Trainer) if each.name == "callbacks"]
 
-    mine = build(hint, {"class_path": "of_mine.Mine", "init_args": {"part": {"class_path": "of_mine.Part"}}})
-    monitor = build(hint, {"class_path": "ThroughputMonitor", "init_args": {"batch_size_fn": "of_mine.size"}})
+    mine = build(parser_of(hint), {"class_path": "of_mine.Mine", "init_args": {"part": {"class_path": "of_mine.Part"}}})
+    monitor = build(
+        parser_of(hint), {"class_path": "ThroughputMonitor", "init_args": {"batch_size_fn": "of_mine.size"}}
+    )
 
     assert type(mine.part).__name__ == "Part"
     assert monitor.batch_size_fn(None) == 3
     called = {"class_path": "of_mine.call", "init_args": {"batch": 1}}
     with pytest.raises(ForbesError, match=r"batch_size_fn: of_mine\.call is not a class that fits here"):
-        build(hint, {"class_path": "ThroughputMonitor", "init_args": {"batch_size_fn": called}})
+        build(parser_of(hint), {"class_path": "ThroughputMonitor", "init_args": {"batch_size_fn": called}})
     assert not Path("executed").exists()

@@ -6,8 +6,9 @@ from typing import get_args
 
 from forbes.choices import PASSES, SUBSET, Split
 from forbes.commands.arguments import ArgumentParser, RunsParser, positive
+from forbes.errors import ForbesError
 
-__all__ = ["add_acting_samples", "add_output", "add_score_options", "parser"]
+__all__ = ["add_acting_samples", "add_output", "add_score_options", "parser", "require_effect"]
 
 
 _DESCRIPTION = f"""\
@@ -114,3 +115,27 @@ def add_score_options(parser: argparse._ActionsContainer) -> None:
 
 def _all_or_number(text: str) -> int:
     return sys.maxsize if text == "all" else positive(text)
+
+
+def require_effect(args: argparse.Namespace, agents: bool) -> None:
+    """Refuse options that would have no effect: those of scores for agents or of other scores, and those of episodes.
+
+    Args:
+        args: parsed options.
+        agents: whether the runs are those of agents.
+
+    Raises:
+        ForbesError: for the first such option.
+    """
+    if args.checkpoint is not None and not args.runs:
+        raise ForbesError("--checkpoint: is of a run, and none is named. Name the file as an argument of the --model")
+    unused = {*PASSES.values()} - {PASSES[name] for name in args.scores}
+    unused |= {"context"} - {"context" for name in args.scores if name == "open-loop"}
+    for name in () if agents else sorted(unused):
+        if getattr(args, name) != parser().get_default(name):
+            raise ForbesError(f"--{name}: no score of --scores {' '.join(args.scores)} uses it. Leave it out")
+    of_scores = ("scores", "split", "sequences", "samples", "particles", "futures", "context", "batch_size", "data")
+    for name in of_scores if agents else ("episodes", "acting_samples"):
+        if getattr(args, name) != parser().get_default(name):
+            kind = "world models" if agents else "agents"
+            raise ForbesError(f"--{name.replace('_', '-')}: is for {kind}, and none is named. Leave it out")

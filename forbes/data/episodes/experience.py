@@ -10,8 +10,9 @@ from torch import Tensor
 from forbes.choices import LONGEST
 from forbes.data.episodes.collection import MakePolicy, describe_environment, episode_seed, play_whole
 from forbes.data.episodes.episode import Episode, EpisodeRecord
+from forbes.data.episodes.index import first_held
 from forbes.data.episodes.replay import Replay, Segments
-from forbes.data.episodes.store import EpisodeStore, EpisodeWriter, first_held
+from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.data.episodes.worker import EpisodeWorker
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.distributed import gathered, num_ranks, rank

@@ -1,6 +1,7 @@
 """The index of an episode store: lines are appended; when many are obsolete, the file is rewritten."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ from forbes.data.episodes.episode import EpisodeRecord
 from forbes.errors import ForbesError
 from forbes.files import append_whole, replace_file
 
-__all__ = ["EpisodeIndex"]
+__all__ = ["EpisodeIndex", "first_held"]
 
 _SPARE = 1000
 """Number of lines in excess of two per episode before an index is compacted."""
@@ -71,6 +72,8 @@ class EpisodeIndex:
         elif event == "set_aside_from":
             self.watermark = min(self.watermark, _count(value))
             self.records = {number: record for number, record in self.records.items() if number < value}
+            if self.watermark == 0:  # a new start, of which nothing was forgotten
+                self.first = self.forgotten_steps = self.forgotten_frames = 0
         elif event == "forgotten_before":
             self.first = max(self.first, _count(value))
             for number in [number for number in self.records if number < value]:
@@ -129,3 +132,14 @@ def _count(value: Any) -> int:
     if type(value) is not int or value < 0:
         raise TypeError(value)
     return value
+
+
+def first_held(records: Iterable[EpisodeRecord], capacity: int | None) -> int:
+    """Return the number of the oldest episode within `capacity` agent steps. The latest one is always included."""
+    first, steps = 0, 0
+    for record in reversed(list(records)):
+        steps += record.steps
+        if capacity is not None and first and steps > capacity:
+            return first
+        first = record.number
+    return first

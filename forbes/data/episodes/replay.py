@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forbes.data.episodes.episode import EpisodeRecord
-from forbes.data.episodes.store import EpisodeStore, first_held
+from forbes.data.episodes.index import first_held
+from forbes.data.episodes.store import EpisodeStore
 from forbes.data.source import SequenceBatch, SequenceSource, Split
 from forbes.errors import ForbesError, require_at_least
 from forbes.factors import Discrete, as_discrete
@@ -209,6 +210,10 @@ class Replay(SequenceSource):
             ends = record.terminated and end == record.steps + 1
             self.store.read(number, start, segments.begin(row, end - start, ends))
         return segments
+
+    def episodes(self, split: Split, index: Tensor) -> list[int]:
+        """Return the number of the episode of each segment, for an index int64 (B,)."""
+        return [number for number, _ in self._locate(split, index)]
 
     def _locate(self, split: Split, index: Tensor) -> Iterator[tuple[int, int]]:
         """Yield the number of the episode and the start of each segment."""

@@ -45,7 +45,7 @@ from forbes.data.episodes.verified import VerifiedFiles
 from forbes.errors import ForbesError
 from forbes.files import drop_half_line, locked, remove_halves, replace_file
 
-__all__ = ["EpisodeStore", "EpisodeWriter", "first_held"]
+__all__ = ["EpisodeStore", "EpisodeWriter"]
 
 _SHOWN = 2**30
 """Bytes to verify from which on a progress bar is shown, since they take a second."""
@@ -157,6 +157,7 @@ class EpisodeStore:
 
         Raises:
             DamagedEpisodeError: if the file does not match the index.
+            ForbesError: if another process has removed it.
         """
         path, key = self.file(number), self._key(number)
         try:
@@ -164,8 +165,11 @@ class EpisodeStore:
                 if key not in self._files or self._files[key].stamp != stamp_of(file):
                     self._files[key] = self._locate(number)
                 whole = self._files[key].read(file, start, into)
-        except FileNotFoundError as error:
-            raise DamagedEpisodeError(path, "it is missing") from error
+        except (FileNotFoundError, DamagedEpisodeError) as error:
+            if not path.exists() and number not in EpisodeIndex(self.path / "index.jsonl").records:
+                removed = f"{path}: the process that writes episodes here has removed it since"
+                raise ForbesError(f"{removed}. Read a copy of the folder, or set a smaller capacity") from error
+            raise error if isinstance(error, DamagedEpisodeError) else DamagedEpisodeError(path, "it is missing")
         if not whole:
             raise DamagedEpisodeError(path, "it ended while it was read")
 
@@ -283,12 +287,17 @@ class EpisodeWriter(EpisodeStore):
         """Go back to a checkpoint: move the episodes from this number on to `set_aside/`, and return their number.
 
         Raises:
-            ForbesError: if the store has had fewer episodes.
+            ForbesError: if the store has had fewer episodes, or has deleted some of those before.
         """
         if watermark > self.watermark:
             raise ForbesError(
                 f"{self.path}: has {self.watermark} episodes, expected the {watermark} of the checkpoint. "
                 "Name the folder of that run"
+            )
+        if 0 < watermark < self.index.first:
+            raise ForbesError(
+                f"{self.path}: its episodes before {self.index.first} were deleted, expected those before {watermark} "
+                "of the checkpoint. Resume from a later one"
             )
         later = sum(number >= watermark for number in self.records)
         if watermark < self.watermark:
@@ -327,17 +336,6 @@ class EpisodeWriter(EpisodeStore):
                 self.file(number).unlink()
             elif number not in self.records:
                 _move(self.file(number), self.path / "set_aside")
-
-
-def first_held(records: Iterable[EpisodeRecord], capacity: int | None) -> int:
-    """Return the number of the oldest episode within `capacity` agent steps. The latest one is always included."""
-    first, steps = 0, 0
-    for record in reversed(list(records)):
-        steps += record.steps
-        if capacity is not None and first and steps > capacity:
-            return first
-        first = record.number
-    return first
 
 
 def _move(path: Path, folder: Path) -> None:

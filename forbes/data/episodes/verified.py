@@ -1,10 +1,11 @@
 """Which files of an episode store were compared with their hashes, so that this is done once, not in every process."""
 
 import json
-import os
+from contextlib import suppress
 from pathlib import Path
 
 from forbes.data.episodes.episode import Stamp
+from forbes.errors import ForbesError
 from forbes.files import append_whole
 
 __all__ = ["VerifiedFiles"]
@@ -16,7 +17,7 @@ class VerifiedFiles:
     Any process may append. A line that cannot be read, or a lost file, only means that episodes are hashed again.
 
     Args:
-        path: the file; need not exist, and is not written if its folder is read-only.
+        path: the file; need not exist, and is not needed if it cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -36,8 +37,9 @@ class VerifiedFiles:
         """Record files that were verified at these stamps."""
         new = {sha256: stamp for sha256, stamp in stamps.items() if self._stamps.get(sha256) != stamp}
         self._stamps |= new
-        if new and os.access(self.path.parent, os.W_OK):
-            append_whole(self.path, json.dumps(new).encode() + b"\n")
+        if new:
+            with suppress(ForbesError):  # the store may be somebody else's, or the disk full
+                append_whole(self.path, json.dumps(new).encode() + b"\n")
 
 
 def _stamp(values: list[int]) -> Stamp:

@@ -83,7 +83,8 @@ class Arrays(Reader):
         """Read the steps of an episode."""
         start, end = self._bounds[number].tolist()
         values = {key: self._arrays[key][start:end] for key in keys}
-        after = {key: found[end - 1 : end] for key in keys if (found := self._after(key))}
+        observed = [key for key in keys if key not in (*self.actions, *self.rewards)]
+        after = {key: found[end - 1 : end] for key in observed if (found := self._after(key))}
         values |= {key: np.concatenate([values[key], after[key]]) for key in after}
         terminated = bool(after) and bool(self._terminals[end - 1])
         return Recorded(f"{self._path}: steps {start} to {end - 1}", values, terminated)

@@ -18,6 +18,8 @@ from forbes.reading import readable
 __all__ = ["Frames"]
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
+_GREY, _COLOURS = ("1", "L"), ("P", "PA", "LA", "La", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
+"""Modes of pictures of 8 bits; those with more would be cut off at white."""
 
 
 class Frames(Reader):
@@ -39,6 +41,8 @@ class Frames(Reader):
 
     def __init__(self, path: Path) -> None:
         self._episodes = _episodes(path)
+        if several := [folder for folder in path.iterdir() if folder.is_dir() and len(_tables(folder)) > 1]:
+            raise ForbesError(f"{min(several)}: has several .csv, expected one beside its pictures. Move the others")
         first = next((frames for frames, _ in self._episodes), path)
         self.fps = frame_rate(first) if first.is_file() else None
 
@@ -65,10 +69,14 @@ def _episodes(path: Path) -> list[tuple[Path, Path]]:
     """Return the frames and the table of each episode: a folder or a video, and a CSV."""
     found = [(video, table) for table in path.glob("*.csv") for video in _videos(table)]
     for folder in path.iterdir():
-        tables = sorted(folder.glob("*.csv")) if folder.is_dir() else []
-        if len(tables) == 1 and _pictures(folder):
+        if folder.is_dir() and len(tables := _tables(folder)) == 1:
             found.append((folder, tables[0]))
     return sorted(found)
+
+
+def _tables(folder: Path) -> list[Path]:
+    """Return the tables of a folder of pictures; none of another folder."""
+    return sorted(folder.glob("*.csv")) if _pictures(folder) else []
 
 
 def _videos(table: Path) -> list[Path]:
@@ -91,15 +99,18 @@ def _images(frames: Path) -> Iterator[NDArray[Any]]:
         return
     for path in _pictures(frames):
         with readable(path, "a picture", "Repair it"), Image.open(path) as picture:
-            grey = picture.mode in ("L", "1", "I;16")
-            yield np.asarray(picture.convert("L" if grey else "RGB"))
+            if picture.mode not in (*_GREY, *_COLOURS):
+                raise ForbesError(f"{path}: its pixels are of mode {picture.mode}, expected 8 bits each. Convert it")
+            yield np.asarray(picture.convert("L" if picture.mode in _GREY else "RGB"))
 
 
 def _columns(path: Path) -> dict[str, NDArray[Any]]:
     """Read a table as the arrays `action`, float64 `(N, A)`, and those of `reward` and `terminated`, `(N,)`."""
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8-sig") as file:  # Excel begins a file with a mark
         names, *lines = list(csv.reader(file)) or [[]]
     names = [name.strip() for name in names]
+    if numbers := [name for name in names if _is_number(name)]:
+        raise ForbesError(f"{path}: its first line has the number {numbers[0]}, expected names. Add a line of names")
     for number, line in enumerate(lines, start=2):
         if len(line) != len(names):
             raise ForbesError(f"{path}: line {number} has {len(line)} values, expected {len(names)}")
@@ -111,3 +122,11 @@ def _columns(path: Path) -> dict[str, NDArray[Any]]:
     if not actions:
         raise ForbesError(f"{path}: has no column for the action, expected some besides reward and terminated")
     return known | {"action": values[:, actions]}
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

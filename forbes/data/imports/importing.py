@@ -71,4 +71,6 @@ def _holds(store: EpisodeStore, number: int, source: Source) -> bool:
 
 def _equal(one: Episode, other: Episode) -> bool:
     ours, theirs = arrays_of(one), arrays_of(other)
+    if (one.terminated, one.frames) != (other.terminated, other.frames):
+        return False
     return ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)

@@ -1,6 +1,6 @@
 """The interface of a format of recorded episodes.
 
-To add a format, copy `dreamer.py`, and name the copy in `formats.py`.
+To add a format, copy `dreamer.py`, and name the copy in `FORMATS` of `forbes/choices.py`.
 """
 
 import importlib

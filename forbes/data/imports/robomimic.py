@@ -43,13 +43,13 @@ class Robomimic(Reader):
     def read(self, number: int, keys: Collection[str]) -> Recorded:
         """Read a group."""
         demo = self._data[self._demos[number]]
-        after, values = demo.get("next_obs", {}), {}
+        after, values, followed = demo.get("next_obs", {}), {}, False
         for key in keys:
             if key in demo["obs"]:
                 values[key] = demo["obs"][key][:]
                 if key in after:
-                    values[key] = np.concatenate([values[key], after[key][-1:]])
+                    values[key], followed = np.concatenate([values[key], after[key][-1:]]), True
             elif key in demo:
                 values[key] = demo[key][:]
-        terminated = bool(after) and "dones" in demo and bool(demo["dones"][-1])
+        terminated = followed and "dones" in demo and bool(demo["dones"][-1])
         return Recorded(f"{self._path}: data/{self._demos[number]}", values, terminated)

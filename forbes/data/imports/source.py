@@ -16,11 +16,9 @@ from forbes.factors import are_one_hot, as_plain, described_sizes, discrete_of, 
 from forbes.reading import readable
 from forbes.shapes import Observed, Shape, map_parts, plain_shape
 
-__all__ = ["REMEDY", "SAMPLE", "Source"]
+__all__ = ["REMEDY", "Source"]
 
 REMEDY = "Repair it or leave it out, and run the same command again"
-SAMPLE = 20
-"""Number of episodes to read before an import, for ranges and to find out whether actions are one-hot."""
 _MOST = 10_000  # numbers of a discrete action, A; larger integers are something else
 
 
@@ -118,7 +116,7 @@ class Source:
             if not problem and found != expected:
                 problem = f"its {name} has shape {found}, expected that of the first episode, {expected}"
         if not problem and self.sizes and not are_one_hot(episode.action[1:], self.sizes):
-            problem = "its actions are not one-hot, but those of the first episodes are"
+            problem = f"its actions are not {described_sizes(self.sizes)}"
         if problem:
             raise ForbesError(f"{recorded.where}: {problem}. {REMEDY}")
         return episode
@@ -141,7 +139,7 @@ class Source:
         return recorded, _Steps(observation, next(iter(lengths.values())), action, reward)
 
     def _part(self, recorded: Recorded, keys: Sequence[str]) -> tuple[NDArray[Any], int]:
-        """Return every k-th image or vector of a part, and the number of all."""
+        """Return every k-th image or vector of a part, the last one included, and the number of all."""
         if keys[0] in self.keys.images:
             return self._images(recorded, recorded.values[keys[0]])  # (n, C, H, W)
         vectors = [_float32(_numbers(recorded, key)) for key in keys]
@@ -149,7 +147,7 @@ class Source:
         if len(lengths := {len(vector) for vector in vectors}) > 1:
             raise ForbesError(f"{recorded.where}: unequal lengths of {self.keys.proprio}: {lengths}. {REMEDY}")
         joined = np.concatenate([vector.reshape(count, -1) for vector in vectors], axis=1)  # (N, O)
-        return joined[:: self.every], count  # (n, O)
+        return joined[(count - 1) % self.every :: self.every], count  # (n, O)
 
     def _read(self, number: int, keys: list[str]) -> Recorded:
         recorded = self.reader.read(number, keys)
@@ -160,13 +158,13 @@ class Source:
 
     def _images(self, recorded: Recorded, frames: Frames) -> tuple[NDArray[np.uint8], int]:
         """Return every k-th image, `(n, C, H, W)`, and the number of all."""
-        kept, count = [], 0
-        for count, frame in enumerate(frames, start=1):
+        images = []
+        for frame in frames:
             if frame.dtype != np.uint8:
                 raise ForbesError(f"{recorded.where}: its image has dtype {frame.dtype}, expected uint8. {REMEDY}")
-            if (count - 1) % self.every == 0:
-                kept.append(to_image(frame, self.resize))
-        return np.stack(kept), count
+            images.append(to_image(frame, self.resize))
+        count = len(images)
+        return np.stack(images[(count - 1) % self.every :: self.every]), count
 
     def _align(self, recorded: Recorded, steps: _Steps) -> Episode:
         """Shift actions and rewards to the observation that they led to, and join those of skipped steps."""
@@ -189,14 +187,15 @@ class Source:
                 "that observation, or remove the line"
             )
         kept = (count - 1) // self.every  # T
-        used = kept * self.every
-        action = self._vectors(recorded, (action[1:] if reader.actions_lead else action)[:used])  # (kT, A)
-        reward = (reward[1:] if reader.rewards_lead else reward)[:used]  # (kT,)
+        used, end = kept * self.every, count - 1
+        action = (action[1:] if reader.actions_lead else action)[end - used : end]  # (kT, ...)
+        action = self._vectors(recorded, action)  # (kT, A)
+        reward = (reward[1:] if reader.rewards_lead else reward)[end - used : end]  # (kT,)
         return Episode(
             observation=observation,  # (T + 1, ...)
             action=_after_zero(action.reshape(kept, self.every * action.shape[1])),  # (T + 1, kA)
             reward=_after_zero(reward.reshape(kept, self.every).sum(1)),  # (T + 1,)
-            terminated=bool(recorded.terminated) and used == count - 1,
+            terminated=bool(recorded.terminated),
             frames=used,
         )
 
@@ -205,7 +204,7 @@ class Source:
         action = action.reshape(len(action), -1)  # (N, F) or (N, A)
         if not self.counted:
             return _float32(action)  # (N, A)
-        if action.dtype.kind not in "biu" or action.shape[1] != len(self.sizes):
+        if not np.array_equal(action, np.round(action)) or action.shape[1] != len(self.sizes):  # floats in a CSV
             found = f"{action.dtype} {action.shape[1:]}"
             raise ForbesError(
                 f"{recorded.where}: its actions are {found}, expected {len(self.sizes)} integers. {REMEDY}"
@@ -227,7 +226,7 @@ class Source:
         where, (shape, dtype) = f"{self.path}: {self.keys.action}", self.fields[self.keys.action]
         columns, whole = int(np.prod(shape, dtype=int)), dtype.kind in "biu"
         if sizes:
-            if (whole and columns == len(sizes)) or columns == sum(sizes):
+            if columns in (len(sizes), sum(sizes)):
                 return sizes, columns != sum(sizes)
             expected = f"{len(sizes)} integers, or {described_sizes(sizes)}"
             raise ForbesError(f"{where} is {dtype} {shape}, expected {expected}. Change --action or --action-sizes")
@@ -242,11 +241,15 @@ class Source:
         return sizes, True
 
     def _seem_one_hot(self, columns: int) -> bool:
-        """Return whether the actions of the first episodes are one-hot vectors."""
+        """Return whether the actions of all episodes are one-hot vectors."""
         certain = slice(None) if self.reader.actions_lead else slice(-1)  # the last one may be no action
-        sample = [self._actions(number)[certain] for number in range(min(SAMPLE, len(self)))]
-        rows = [action for action in sample if len(action)]
-        return bool(rows) and all(are_one_hot(action, (columns,)) for action in rows)
+        any_rows = False
+        for number in range(len(self)):
+            rows = self._actions(number)[certain]  # (N, F)
+            if len(rows) and not are_one_hot(rows, (columns,)):
+                return False
+            any_rows |= len(rows) > 0
+        return any_rows
 
     def _actions(self, number: int) -> NDArray[Any]:
         """Return the actions of an episode, `(N, F)`, without the first one if it led to the first observation."""

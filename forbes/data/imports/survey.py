@@ -1,18 +1,20 @@
 """What recorded episodes have, and what becomes of it: the table that is shown before an import."""
 
-from collections.abc import Sequence
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forbes.data.episodes.episode import Episode
-from forbes.data.imports.source import SAMPLE, Source
+from forbes.data.imports.source import Source
 from forbes.factors import described_sizes
 from forbes.shapes import Observed
 
-__all__ = ["Survey", "survey"]
+__all__ = ["SAMPLE", "Survey", "survey"]
 
+SAMPLE = 20
+"""Number of episodes whose numbers the table is about."""
 _LEADS = "index t has {} that led to o_t, as in a store"
 _FOLLOWS = "index t has {} after o_t: shifted by one, so that index t has what led to o_t"
 
@@ -25,46 +27,72 @@ class Survey(NamedTuple):
     facts: dict[str, str]
 
 
+class _Seen:
+    """What is known of the first episodes, of which one is in memory at a time.
+
+    Args:
+        source: their source.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self.ranges: dict[str, tuple[float, float]] = {}
+        """Least and greatest number of each used key."""
+        self.lengths: list[int] = []
+        self.terminated = 0
+        for number in range(min(SAMPLE, len(source))):
+            episode = source.episode(number)
+            for key, values in _values(source, episode).items():
+                least, most = self.ranges.get(key, (math.inf, -math.inf))
+                self.ranges[key] = min(least, values.min()), max(most, values.max())
+            self.lengths.append(len(episode.reward) - 1)
+            self.terminated += episode.terminated
+
+
 def survey(source: Source) -> Survey:
     """Describe a source, with the ranges of its first `SAMPLE` episodes."""
-    sample = [source.episode(number) for number in range(min(SAMPLE, len(source)))]
-    used = _used(source, sample)
+    seen, used = _Seen(source), _used(source)
+    ranges = {key: f"{least:g} to {most:g}" for key, (least, most) in seen.ranges.items()}
     rows = [
-        (key, *used.get(key, ("not used", ""))[:1], str(shape), str(dtype), used.get(key, ("", ""))[1])
+        (key, used.get(key, "not used"), str(shape), str(dtype), ranges.get(key, ""))
         for key, (shape, dtype) in source.fields.items()
     ]
     order = ["observation", "action", "reward", "not"]
-    return Survey(sorted(rows, key=lambda row: order.index(row[1].partition(" ")[0])), _facts(source, sample))
+    return Survey(sorted(rows, key=lambda row: order.index(row[1].partition(" ")[0])), _facts(source, seen))
 
 
-def _used(source: Source, sample: Sequence[Episode]) -> dict[str, tuple[str, str]]:
-    """Return what each used key becomes, and its range."""
-    keys = source.keys
-    used = {keys.action: ("action", _range([episode.action[1:] for episode in sample]))}
-    if keys.reward is not None:
-        used[keys.reward] = "reward", _range([episode.reward[1:] for episode in sample])
-    parts = keys.parts()
+def _used(source: Source) -> dict[str, str]:
+    """Return what each used key becomes."""
+    keys, parts = source.keys, source.keys.parts()
+    used = {keys.action: "action"} | ({} if keys.reward is None else {keys.reward: "reward"})
     for part, of_part in parts.items():
-        arrays = [episode.observation[part] if len(parts) > 1 else episode.observation for episode in sample]
-        start, becomes = 0, f"observation {part}" if len(parts) > 1 else "observation"
-        for key in of_part:
-            size = int(np.prod(source.fields[key].shape, dtype=int))
-            columns = slice(None) if key in keys.images else slice(start, start + size)
-            used[key] = becomes, _range([array[:, columns] for array in arrays])
-            start += size
+        used |= dict.fromkeys(of_part, f"observation {part}" if len(parts) > 1 else "observation")
     return used
 
 
-def _facts(source: Source, sample: Sequence[Episode]) -> dict[str, str]:
-    reader, first = source.reader, sample[0]
-    lengths = [len(episode.reward) - 1 for episode in sample]
-    of_sample = "" if len(sample) == len(source) else f" (of the first {len(sample)})"
-    ended = sum(episode.terminated for episode in sample)
+def _values(source: Source, episode: Episode) -> dict[str, NDArray[Any]]:
+    """Return the numbers of each used key in an episode."""
+    keys, parts = source.keys, source.keys.parts()
+    values = {keys.action: episode.action[1:]}
+    if keys.reward is not None:
+        values[keys.reward] = episode.reward[1:]
+    for part, of_part in parts.items():
+        array, start = episode.observation[part] if len(parts) > 1 else episode.observation, 0
+        for key in of_part:
+            size = int(np.prod(source.fields[key].shape, dtype=int))
+            values[key] = array if key in keys.images else array[:, start : start + size]
+            start += size
+    return values
+
+
+def _facts(source: Source, seen: _Seen) -> dict[str, str]:
+    reader, first, lengths = source.reader, source.first, seen.lengths
+    of_sample = "" if len(lengths) == len(source) else f" (of the first {len(lengths)})"
+    steps = f"{min(lengths)} to {max(lengths)} steps"
     facts = {
         "format": reader.name,
-        "episodes": f"{len(source)}, of {min(lengths)} to {max(lengths)} steps, {ended} terminated{of_sample}",
+        "episodes": f"{len(source)}, of {steps}, {seen.terminated} terminated{of_sample}",
         "observation": _arrays(first.observation),
-        "action": f"float32 {first.action.shape[1:]}, {_kind(source, sample)}",
+        "action": f"float32 {first.action.shape[1:]}, {_kind(source, *seen.ranges[source.keys.action])}",
         "alignment": _alignment(source),
     }
     if source.drops_last:
@@ -94,14 +122,9 @@ def _alignment(source: Source) -> str:
     return f"{_FOLLOWS.format('the action')}; it has the reward that came with o_t, as in a store"
 
 
-def _kind(source: Source, sample: Sequence[Episode]) -> str:
+def _kind(source: Source, least: float, most: float) -> str:
     if source.sizes:
         return described_sizes(source.sizes)
-    if max(float(np.abs(episode.action).max()) for episode in sample) > 1:
+    if max(-least, most) > 1:
         return "beyond [-1, 1] and kept as it is: an agent here would act within [-1, 1]"
     return "within [-1, 1]"
-
-
-def _range(values: list[NDArray[Any]]) -> str:
-    least, most = (function([getattr(array, function.__name__)() for array in values]) for function in (min, max))
-    return f"{least:g} to {most:g}"

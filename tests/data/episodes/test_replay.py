@@ -201,8 +201,9 @@ def anonymous_memory():
 
 
 def test_memory_does_not_grow_with_the_store(tmp_path):
-    """A sparse store of 1 GiB: its black frames take no room on the disk, but they would in memory."""
-    path, copies, steps = tmp_path / "store", 20, 4400
+    """A sparse store of 300 MiB: its black frames take no room on the disk, but they would in memory."""
+    path, copies, steps = tmp_path / "store", 6, 4400
+    limit = 100 * 2**20
     frames = np.zeros((steps, 3, 64, 64), np.uint8)
     whole = Episode(frames, np.zeros((steps, 1), np.float32), np.zeros(steps, np.float32), False, steps - 1)
     about = {"task": "Night", "observation_shape": [3, 64, 64], "action_dim": 1, "discrete": False}
@@ -219,7 +220,7 @@ def test_memory_does_not_grow_with_the_store(tmp_path):
             if number:
                 writer.index.append(record._replace(number=number)._asdict())
     assert pack_episode(whole, {})[:30] == content[:30]
-    assert sum(file.stat().st_size for file in path.glob("*.npz")) > 2**30
+    assert sum(file.stat().st_size for file in path.glob("*.npz")) > 3 * limit
     del frames, whole, content
     source = Replay(str(path), hold_out=0)
 
@@ -227,7 +228,7 @@ def test_memory_does_not_grow_with_the_store(tmp_path):
     for update in range(40):
         source.gather("train", source.train_index(16, 16, 0, update), 16)
 
-    assert anonymous_memory() - before < 100 * 1024
+    assert (anonymous_memory() - before) * 1024 < limit
 
 
 def test_it_trains_a_world_model(tmp_path, tiny_config, in_tmp_path):

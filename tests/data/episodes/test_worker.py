@@ -8,6 +8,7 @@ import sys
 import time
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -68,7 +69,7 @@ def test_a_broken_episode_is_played_again(tmp_path):
 
 @pytest.mark.parametrize("trouble", ["raises", "hangs"])
 def test_an_environment_that_breaks_each_time_is_named(trouble, tmp_path):
-    timeout = 1.0 if trouble == "hangs" else 60.0
+    timeout = 0.5 if trouble == "hangs" else 60.0
     with closing(EpisodeWorker(partial(Troubled, trouble, tmp_path / "ledger", times=9), timeout)) as player:
         player.begin(Said(0.5), number=4, seed=0)
         with pytest.raises(ForbesError, match=f"{trouble}.* episode 4 failed 3 times and was not stored"):
@@ -112,11 +113,16 @@ def test_a_signal_to_a_player_that_starts_is_left_to_its_parent(number, capfd):
     assert capfd.readouterr().err == ""
 
 
+def touch_and_sleep(path):
+    Path(path).touch()
+    time.sleep(3600)
+
+
 class SlowToImport:
-    """Makes an environment, in a process that imports what it needs for an hour."""
+    """Makes an environment, in a process that imports what it needs for an hour; a file says that it has begun."""
 
     def __reduce__(self):
-        return time.sleep, (3600,)
+        return touch_and_sleep, ("imports",)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
@@ -124,21 +130,20 @@ class SlowToImport:
 def test_a_process_that_still_imports_ends_with_its_parent(tmp_path, kind):
     module, _, name = kind.rpartition(".")
     program = f"""
-import multiprocessing, threading, time
+import multiprocessing, pathlib, threading, time
 from {module} import {name}
 from test_worker import SlowToImport
 if __name__ == "__main__":
     threading.Thread(target={name}, args=(SlowToImport(),), daemon=True).start()
-    while not (children := multiprocessing.active_children()):
+    while not pathlib.Path("imports").exists():
         time.sleep(0.01)
-    time.sleep(2)
-    print(children[0].pid, flush=True)
+    print(multiprocessing.active_children()[0].pid, flush=True)
     time.sleep(3600)
 """
     (tmp_path / "parent.py").write_text(program)
     paths = os.pathsep.join([os.path.dirname(__file__), *filter(None, sys.path)])
     command, environ = [sys.executable, str(tmp_path / "parent.py")], os.environ | {"PYTHONPATH": paths}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environ) as parent:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environ, cwd=tmp_path) as parent:
         child = int(parent.stdout.readline())
         parent.kill()
 

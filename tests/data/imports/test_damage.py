@@ -45,10 +45,13 @@ def largest(path):
 def test_a_truncated_recording_is_refused(name, tmp_path):
     path = recordings.write(name, tmp_path / "recorded", recordings.episodes(5, images=name in PICTURES))
     file = largest(path)
-    options = options_of(name) if file.suffix != ".mp4" or name == "mp4" else {"image": "observation.images.top"}
+    options = options_of(name) if file.suffix != ".mp4" or name == "mp4" else {"images": ["observation.images.top"]}
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
-    assert sentence_of(path, tmp_path / "store", **options)
+    sentence = sentence_of(path, tmp_path / "store", **options)
+
+    assert sentence.startswith(str(path))
+    assert ("line 5 has 1 values, expected 3" if name == "png" else ": truncated or not ") in sentence
 
 
 @pytest.mark.parametrize("name", recordings.FORMATS)
@@ -59,7 +62,8 @@ def test_a_value_that_is_no_number_is_refused_with_its_place(name, tmp_path):
 
     sentence = sentence_of(path, tmp_path / "store", **options_of(name))
 
-    assert "its action is not finite at step 2" in sentence or "not finite at step 2" in sentence
+    episode = r"(/003\.npz|/take-3|/take-3\.mp4|: data/demo_3|: steps 15 to 21|: episode 3)"  # after 4, 5 and 6 steps
+    assert_matches(rf"{episode}: its action is not finite at step 2\.", sentence)
 
 
 def rewrite(path, **changes):

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import recordings
 from forked import run_in_a_fork
+from PIL import Image
 
 from forbes.choices import EXPORTS
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
 from forbes.data.exports import export_store
 from forbes.data.imports.formats import open_reader
 from forbes.data.imports.importing import import_episodes, is_imported, partial_path
-from forbes.data.imports.source import SAMPLE, Source
+from forbes.data.imports.source import Source
 from forbes.data.imports.survey import survey
 from forbes.errors import ForbesError
 from forbes.factors import factor_sizes, to_one_hot
@@ -238,14 +239,15 @@ def test_an_episode_of_one_step_leaves_actions_one_hot(tmp_path):
     assert source(tmp_path / "recorded").discrete
 
 
-def test_actions_that_stop_being_one_hot_are_refused(tmp_path):
+def test_actions_that_stop_being_one_hot_are_numbers(tmp_path):
     (tmp_path / "recorded").mkdir()
-    for number in range(SAMPLE + 1):
-        action = np.array([[0, 0], [1, 0], [0, 1 if number < SAMPLE else 2]])
-        np.savez(tmp_path / "recorded" / f"{number:02d}.npz", state=np.ones(3), action=action)
+    for number in range(3):
+        action = np.array([[0, 0], [1, 0], [0, 1 if number < 2 else 2]], float)
+        np.savez(tmp_path / "recorded" / f"{number}.npz", state=np.ones(3), action=action)
 
-    with pytest.raises(ForbesError, match=r"20\.npz: its actions are not one-hot, but those of the first episodes are"):
-        imported(tmp_path / "recorded", tmp_path / "store")
+    assert not source(tmp_path / "recorded").discrete
+    with pytest.raises(ForbesError, match=r"2\.npz: its actions are not a one-hot vector"):
+        imported(tmp_path / "recorded", tmp_path / "store", action_sizes=[2])
 
 
 def test_parts_of_a_minari_data_set_are_chosen_by_key(tmp_path, monkeypatch):
@@ -289,6 +291,125 @@ def test_a_lower_rate_joins_actions_and_sums_rewards(tmp_path):
         source(path, proprio=["observation.state"], fps=4)
     with pytest.raises(ForbesError, match="--fps 4 needs the rate of the data"):
         source(recordings.write("dreamer", tmp_path / "dreamer", theirs), fps=4)
+
+
+def test_a_lower_rate_keeps_the_end(tmp_path):
+    """The frames that are left over are the first ones: the last reward and the termination often are the task."""
+    theirs = recordings.episodes(2, images=True)
+    path = recordings.write("mp4", tmp_path / "recorded", theirs)
+
+    ours = source(path, images=["image"], fps=recordings.FPS / 2).episode(1)  # of 5 steps
+
+    grey = theirs[1].observation[1::2, 0, 0, 0].astype(int)
+    np.testing.assert_allclose(ours.observation[:, 0, 0, 0], grey, atol=4)  # lossy
+    np.testing.assert_allclose(ours.action[1:], theirs[1].action[2:].reshape(2, 2), rtol=1e-6)
+    np.testing.assert_allclose(ours.reward[1:], theirs[1].reward[2:].reshape(2, 2).sum(1), rtol=1e-6)
+    assert (ours.frames, ours.terminated) == (4, True)
+
+
+def takes(path, text, pictures, **encoding):
+    """Write an episode of pictures, and its table."""
+    (path / "take-0").mkdir(parents=True)
+    for number, picture in enumerate(pictures):
+        Image.fromarray(picture).save(path / "take-0" / f"{number}.png")
+    (path / "take-0" / "actions.csv").write_text(text, **encoding)
+    return path
+
+
+GREY = np.zeros((3, 4, 4), np.uint8)
+
+
+def test_a_mark_at_the_start_of_a_table_is_no_part_of_a_name(tmp_path):
+    path = takes(tmp_path / "takes", "reward,a\n100,0.1\n101,0.2\n", GREY, encoding="utf-8-sig")
+
+    episode = source(path, images=["image"]).episode(0)
+
+    np.testing.assert_allclose(episode.action[1:], [[0.1], [0.2]], rtol=1e-6)
+    assert episode.reward.tolist() == [0, 100, 101]
+
+
+@pytest.mark.parametrize(
+    ("text", "pictures", "sentence"),
+    [
+        ("0.0\n0.1\n0.2\n", GREY, r"actions\.csv: its first line has the number 0\.0, expected names\. Add a line"),
+        ("a\n0.1\n0.2\n", GREY.astype(np.uint16), r"0\.png: its pixels are of mode I;16, expected 8 bits each"),
+    ],
+    ids=["no names", "16 bits"],
+)
+def test_what_would_be_read_otherwise_than_meant_is_refused(text, pictures, sentence, tmp_path):
+    with pytest.raises(ForbesError, match=sentence):
+        source(takes(tmp_path / "takes", text, pictures), images=["image"])
+
+
+def test_a_folder_with_two_tables_is_named(tmp_path):
+    path = takes(tmp_path / "takes", "a\n0.1\n0.2\n", GREY)
+    (path / "take-0" / "notes.csv").write_text("a\n1\n")
+
+    with pytest.raises(ForbesError, match=r"take-0: has several \.csv, expected one beside its pictures"):
+        open_reader(path, "frames")
+
+
+def test_choices_in_a_table_are_counted_by_their_sizes(tmp_path):
+    path = takes(tmp_path / "takes", "button,lever\n2,0\n1,1\n", GREY)
+
+    episode = source(path, images=["image"], action_sizes=[3, 2]).episode(0)
+
+    assert episode.action[1:].tolist() == [[0, 0, 1, 1, 0], [0, 1, 0, 0, 1]]
+    (path / "take-0" / "actions.csv").write_text("button,lever\n2,0\n0.5,1\n")
+    with pytest.raises(ForbesError, match="expected 2 integers"):
+        source(path, images=["image"], action_sizes=[3, 2])
+
+
+def test_corrected_ends_are_not_imported_already(recorded, tmp_path):
+    imported(recorded, tmp_path / "store")
+    for path in recorded.iterdir():
+        with np.load(path) as file:
+            np.savez(path, **{name: file[name] & False if name == "is_terminal" else file[name] for name in file})
+
+    with pytest.raises(ForbesError, match="exists and is not a store of"):
+        is_imported(source(recorded), tmp_path / "store")
+
+
+def test_the_state_of_robomimic_is_not_followed_by_an_observation(tmp_path):
+    """`next_obs` is of `obs` alone, so that the observation after the last action is not known."""
+    import h5py
+
+    path = recordings.write("robomimic", tmp_path / "recorded.hdf5", recordings.episodes(2))
+    with h5py.File(path, "r+") as file:
+        for demo in file["data"].values():
+            demo["states"], demo["rewards"][-1] = np.arange(len(demo["actions"]), dtype=np.float32), 0.0
+
+    episode = source(path, proprio=["states"]).episode(1)
+
+    assert (len(episode.observation), episode.terminated) == (5, False)
+
+
+def test_the_next_action_of_d4rl_is_not_one_of_the_episode(tmp_path):
+    import h5py
+
+    path = recordings.write("d4rl", tmp_path / "recorded.hdf5", recordings.episodes(3))
+    expected = source(path).episode(1)
+    with h5py.File(path, "r+") as file:
+        file["next_actions"] = file["actions"][:]
+
+    for ours, theirs in zip(source(path).episode(1), expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_table_needs_the_memory_of_one_episode(tmp_path):
+    (tmp_path / "recorded").mkdir()
+    size = 4 * 100 * 10_000  # bytes of an episode in float32
+    for number in range(10):
+        action, state = np.zeros((100, 1)), np.full((100, 10_000), number, np.float32)
+        np.savez(tmp_path / "recorded" / f"{number}.npz", state=state, action=action)
+    found = source(tmp_path / "recorded")
+
+    tracemalloc.start()
+    survey(found)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+
+    assert peak < 6 * size  # one of ten at a time, which is read, converted and checked
 
 
 def test_the_table_says_what_becomes_of_each_key(tmp_path):

@@ -25,6 +25,7 @@ from forbes.evaluation.scoring import score_split
 from forbes.models import Bernoulli, MLPDecoder, MLPEncoder, ModelParts, StateSpaceModel
 
 CONTEXT, LENGTH = 5, 30
+FEW = {"validation": 59_000}  # a thousand digits to train on
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def classifiers():
 
 @pytest.fixture(scope="module")
 def data():
-    return SequenceDataModule(Strokes(frames="whole"), length=LENGTH)
+    return SequenceDataModule(Strokes(frames="whole", **FEW), length=LENGTH)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,7 @@ def test_prefixes_are_of_digits_that_continue_sorted_by_length(data, classifiers
 
 
 def test_digits_end_where_they_do_also_if_models_observe_their_end(classifiers, prefixes):
-    observed = SequenceDataModule(Strokes(frames="whole", end="observed"), length=LENGTH)
+    observed = SequenceDataModule(Strokes(frames="whole", end="observed", **FEW), length=LENGTH)
     chosen = select_prefixes(observed, "test", 20, CONTEXT, classifiers.prefix)
 
     steps = [batch.mask.sum(1) for _, batch in chosen.batches(observed, "test")]
@@ -245,7 +246,7 @@ def test_similar_digits_stand_in_for_completions(model, data, prefixes, classifi
 
 @pytest.mark.parametrize("points_per_step", [1, 2])
 def test_an_ngram_draws_on_from_what_was_seen(model, classifiers, points_per_step):
-    data = SequenceDataModule(Strokes(points_per_step=points_per_step, frames="written"), length=LENGTH)
+    data = SequenceDataModule(Strokes(points_per_step=points_per_step, frames="written", **FEW), length=LENGTH)
     few = select_prefixes(data, "test", 6, CONTEXT, classifiers.prefix)
     shorter = few._replace(steps=few.steps.clamp(max=CONTEXT + 1))  # of which one step is drawn
 
@@ -260,7 +261,7 @@ def test_an_ngram_draws_on_from_what_was_seen(model, classifiers, points_per_ste
 
 
 def test_written_strokes_are_read_as_whole_frames_are(model, data, prefixes, classifiers):
-    written = SequenceDataModule(Strokes(frames="written"), length=LENGTH)
+    written = SequenceDataModule(Strokes(frames="written", **FEW), length=LENGTH)
 
     few, same = (select_prefixes(each, "test", 3, CONTEXT, classifiers.prefix) for each in (data, written))
 
