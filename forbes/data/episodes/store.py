@@ -169,7 +169,9 @@ class EpisodeStore:
             if not path.exists() and number not in EpisodeIndex(self.path / "index.jsonl").records:
                 removed = f"{path}: the process that writes episodes here has removed it since"
                 raise ForbesError(f"{removed}. Read a copy of the folder, or set a smaller capacity") from error
-            raise error if isinstance(error, DamagedEpisodeError) else DamagedEpisodeError(path, "it is missing")
+            if isinstance(error, DamagedEpisodeError):
+                raise
+            raise DamagedEpisodeError(path, "it is missing") from error
         if not whole:
             raise DamagedEpisodeError(path, "it ended while it was read")
 
