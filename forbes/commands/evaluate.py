@@ -21,7 +21,7 @@ from forbes.commands.tables import (
     print_references,
     print_runs,
 )
-from forbes.data import Replay, Simulated
+from forbes.data import Simulated
 from forbes.errors import ForbesError
 from forbes.evaluation.adapters import adapter_folder, load_all
 from forbes.evaluation.estimates import Estimate
@@ -107,7 +107,7 @@ def _main(argv: Sequence[str]) -> None:
     if not is_first():
         return
     print_runs(measured)
-    _tell_shared_episodes(measured, args.split)
+    _tell_single_episode(measured)
     print_references(measured)
     if len(measured) > 1:
         print_pairs(compare_pairs(measured))
@@ -115,15 +115,15 @@ def _main(argv: Sequence[str]) -> None:
     print_images(measured)
 
 
-def _tell_shared_episodes(measured: Sequence[EvaluatedRun], split: Split) -> None:
-    """Print that standard errors are too small, where several sequences are parts of one episode."""
-    source = measured[0].run.data.source
-    count = max(int(entry["sequences"]) for entry in measured[0].entries.values())
-    if isinstance(source, Replay) and (episodes := len({*source.episodes(split, torch.arange(count))})) < count:
-        print(
-            f"{count} sequences are parts of {episodes} episodes: standard errors, which take them as independent, are "
-            "too small"
-        )
+def _tell_single_episode(measured: Sequence[EvaluatedRun]) -> None:
+    """Print that standard errors are too small, where all sequences are parts of one episode."""
+    for entry in itertools.chain.from_iterable(evaluated.entries.values() for evaluated in measured[:1]):
+        if len({*entry.get("episode_of", (0, 1))}) == 1:
+            print(
+                f"all {entry['sequences']} sequences are parts of one episode: standard errors take them as "
+                "independent, and are too small"
+            )
+            return
 
 
 def evaluate(runs: Sequence[TrainedRun], args: Any, command: str, folders: Mapping[str, Path]) -> list[EvaluatedRun]:
@@ -174,15 +174,17 @@ def _add_references(evaluated: EvaluatedRun, jobs: Sequence[_Job], split: Split)
             found[job.sequences] = references(evaluated.run.data, evaluated.run.model.likelihood, split, job.sequences)
         for metric in scores:
             name = _metric_name(evaluated.run, job, metric, split)
+            total, episodes = evaluated.totals[name], evaluated.entries[name].get("episode_of")
             evaluated.entries[name]["references"] = {
-                reference: _reference(evaluated.totals[name], values[:, job.score.context :].sum(1))
+                reference: _reference(total, values[:, job.score.context :].sum(1), episodes)
                 for reference, values in found[job.sequences].items()
             }
 
 
-def _reference(scores: Tensor, reference: Tensor) -> dict[str, Any]:
+def _reference(scores: Tensor, reference: Tensor, episodes: Sequence[int] | None) -> dict[str, Any]:
     """Return the estimate of a reference, and that of the scores minus it, paired over the sequences, `(N,)` each."""
-    return {**Estimate.of(reference)._asdict(), "difference": Estimate.of(scores - reference)._asdict()}
+    difference = Estimate.of(scores - reference, episodes)
+    return {**Estimate.of(reference, episodes)._asdict(), "difference": difference._asdict()}
 
 
 def _image_entries(run: TrainedRun, jobs: Sequence[_Job], number: int, args: Any) -> dict[str, dict[str, Any]]:
@@ -329,10 +331,11 @@ def _measure(evaluated: EvaluatedRun, job: _Job, sha256: str, args: Any, parts: 
     batches = split_batches(run.data, args.split, job.sequences, score.batch_size)
     batches = with_progress(batches, f"{run.path} {job.name}", job.sequences)
     scores = score_split(run.model, batches, score, args.seed, f"{run.path}, {args.split} split", parts, per_rank=True)
+    episodes = run.data.source.episodes(args.split, torch.arange(job.sequences))
     for metric in score.metrics:
         name = _metric_name(run, job, metric, args.split)
         evaluated.totals[name] = scores.total(metric)
-        evaluated.entries[name] = describe(scores, metric) | _about(run, sha256, began)
+        evaluated.entries[name] = describe(scores, metric, episodes) | _about(run, sha256, began)
 
 
 def _about(run: TrainedRun, sha256: str, began: float) -> dict[str, Any]:

@@ -97,6 +97,15 @@ class SequenceSource(Named, ABC):
     def size(self, split: Split) -> int:
         """Return the number of sequences of a split."""
 
+    def episodes(self, split: Split, index: Tensor) -> list[int] | None:
+        """Return the number of the episode of each sequence, if several are parts of one: they are not independent.
+
+        Args:
+            split: train, validation or test.
+            index: numbers of sequences, int64 (B,).
+        """
+        return None
+
     @abstractmethod
     def gather(self, split: Split, index: Tensor, length: int) -> Any:
         """Return sequences by index, int64 (B,), cut or padded to `length` steps, in compact form on the CPU."""

@@ -136,7 +136,8 @@ def _paired(family: Family, first: Family, metric: str) -> list[dict[str, Any]]:
                 f"{len(other)}, expected the same. Evaluate both again"
             )
         values = one - other  # (N,)
-        difference = Estimate.of(torch.from_numpy(values))._asdict()
+        episodes = read_record(family.runs[seed])[metric].get("episode_of")
+        difference = Estimate.of(torch.from_numpy(values), episodes)._asdict()
         rows.append({"family": family.name, "metric": metric, "seed": seed, **difference})
     return rows
 

@@ -1,7 +1,7 @@
 """Measure the contrast of a claim from the records of runs, seed by seed."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,8 @@ def _paired(claim: Claim, runs: Mapping[str, str]) -> Estimate | None:
         tasks[task] = tasks.get(task, 0.0) + claim.sign * sign * scores[family]
     if (order := _order(claim, runs)) is None:
         return None
-    estimates = [Estimate.of(torch.from_numpy(values)) for values in tasks.values()]
+    episodes = {task_of(family): _episodes(run, claim.score) for family, run in runs.items()}
+    estimates = [Estimate.of(torch.from_numpy(values), episodes[task]) for task, values in tasks.items()]
     mean, error = sum(one.mean for one in estimates), math.hypot(*(one.standard_error for one in estimates))
     return Estimate(order * mean, error)
 
@@ -89,6 +90,13 @@ def _scores(run: str, score: str) -> NDArray[np.float64] | None:
     """Return the score of each sequence or episode, `(N,)`."""
     found = entry_of(run, score)
     return None if found is None else read_arrays(run).get(found[0])
+
+
+def _episodes(run: str, score: str) -> Sequence[int] | None:
+    """Return the episode of each sequence, if several are of one."""
+    _, entry = entry_of(run, score) or ("", {})
+    found: Sequence[int] | None = entry.get("episode_of")
+    return found
 
 
 def _require_same_data(claim: Claim, runs: Mapping[str, str]) -> None:

@@ -70,7 +70,7 @@ def compare_pairs(measured: Sequence[EvaluatedRun]) -> list[Pair]:
             first,
             second,
             {
-                name: Estimate.of(total - second.totals[name])
+                name: Estimate.of(total - second.totals[name], first.entries[name].get("episode_of"))
                 for name, total in first.totals.items()
                 if score_of(name) in SCORES and name in second.totals
             },

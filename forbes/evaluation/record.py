@@ -30,21 +30,27 @@ __all__ = ["describe", "read_arrays", "read_record", "require_readable", "result
 _REMEDY = "Delete it and evaluate again"
 
 
-def describe(scores: Scores, metric: str) -> dict[str, Any]:
-    """Return the summary of a metric over sequences, in nats: its entry in `evaluation.json`."""
+def describe(scores: Scores, metric: str, episodes: Sequence[int] | None = None) -> dict[str, Any]:
+    """Return the summary of a metric over sequences, in nats: its entry in `evaluation.json`.
+
+    Args:
+        scores: scores of the sequences.
+        metric: name of the metric.
+        episodes: number of the episode of each sequence, if several are of one.
+    """
     values, steps, total = scores.values[metric], scores.steps, scores.total(metric)
     shares = {"minimum": 0.0, "5%": 0.05, "median": 0.5, "95%": 0.95, "maximum": 1.0}
     counts = scores.mask.sum(0)  # (T,)
     last = int(counts.nonzero().max()) + 1  # later steps are padding in all sequences
     return {
-        **Estimate.of(total)._asdict(),
-        "interval_95": bootstrap_interval(total),
-        "per_step": Estimate.per_step(values.sum(1), steps)._asdict(),
+        **Estimate.of(total, episodes)._asdict(),
+        "interval_95": bootstrap_interval(total, episodes),
+        "per_step": Estimate.per_step(values.sum(1), steps, episodes)._asdict(),
         "curve": (values.sum(0) / counts.clamp(min=1))[:last].tolist(),
         "quantiles": {name: total.quantile(share).item() for name, share in shares.items()},
         "sequences": len(total),
         "steps": int(steps.sum()),
-    }
+    } | ({} if episodes is None else {"episode_of": [*episodes]})
 
 
 def results_folders(runs: Sequence[str], output: str | None = None) -> dict[str, Path]:

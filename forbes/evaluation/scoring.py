@@ -142,7 +142,8 @@ def evaluate(
         seed: random seed for the noise. The same seed and batch size give the same scores.
 
     Returns:
-        Mean and standard error over sequences by metric, in nats per sequence; `ess` as a fraction of K.
+        Mean and standard error over sequences, or stored episodes, by metric, in nats per sequence; `ess` as a
+        fraction of K.
 
     Raises:
         ForbesError: if a score does not exist or is not finite, a number is below 1, there are fewer than two
@@ -164,6 +165,7 @@ def evaluate(
         raise ForbesError(f"evaluate: a standard error needs at least 2 sequences, found {count}. Choose more")
     if isinstance(model, ModelAdapter):
         check_model(model, data, type(model).__name__)
+    episodes = data.source.episodes(split, torch.arange(count))
     numbers = {"samples": samples, "particles": particles, "futures": futures}
     found: dict[str, Estimate] = {}
     for name in scores:
@@ -173,7 +175,7 @@ def evaluate(
         if score.context:
             require_longer("evaluate", data, split, count, score.context)
         scored = score_split(model, split_batches(data, split, count, score.batch_size), score, seed)
-        found |= {metric: Estimate.of(scored.total(metric)) for metric in score.metrics}
+        found |= {metric: Estimate.of(scored.total(metric), episodes) for metric in score.metrics}
     return found
 
 

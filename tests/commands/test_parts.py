@@ -11,10 +11,12 @@ from PIL import Image
 from small_agents import forbes
 from toy_environments import Robot
 
-from forbes import load_run
+from forbes import evaluate, load_run
 from forbes.data import Experience, Replay, SequenceDataModule
 from forbes.data.episodes.collection import collect_episodes, random_policy
 from forbes.data.episodes.store import EpisodeStore, EpisodeWriter
+from forbes.evaluation.estimates import Estimate
+from forbes.evaluation.record import read_arrays, read_record
 from forbes.evaluation.references import references
 from forbes.models import Bernoulli, Normal, PartsLikelihood, VectorNormal
 from forbes.runs.folder import read_metrics
@@ -144,6 +146,22 @@ def test_its_scores_have_references_on_the_same_parts(world):
     by_part = [entry["mean"] for name, entry in scores.items() if "/reconstruction/" in name]
     assert len(by_part) == 2
     assert sum(by_part) == pytest.approx(whole, rel=1e-5)
+
+
+def test_errors_are_over_episodes_and_not_over_their_windows(world, store):
+    assert forbes("evaluate", world, "--scores", "elbo", "--samples", 2) == 0
+
+    name = f"test/{BOUND.replace('S=1', 'S=2')}"
+    entry, values = read_record(str(world))[name], torch.from_numpy(read_arrays(str(world))[name])
+    of_test = [number for number in EpisodeStore(store).records if number % 3 == 2]
+    assert {*entry["episode_of"]} == {*of_test}
+    assert len(entry["episode_of"]) == len(values) > len(of_test) > 1
+    expected = Estimate.of(values, entry["episode_of"])
+    assert entry["standard_error"] == pytest.approx(expected.standard_error)
+    assert entry["standard_error"] != pytest.approx(Estimate.of(values).standard_error, rel=1e-3)
+    data = SequenceDataModule(Replay(str(store), hold_out=3, stride=5), length=6)
+    found = evaluate(load_run(world)[0].model, data, ["elbo"], sequences=len(values), samples=2)
+    assert found["elbo"] == pytest.approx(expected)
 
 
 def test_a_reference_is_the_sum_of_those_of_the_parts(store):

@@ -211,9 +211,10 @@ class Replay(SequenceSource):
             self.store.read(number, start, segments.begin(row, end - start, ends))
         return segments
 
-    def episodes(self, split: Split, index: Tensor) -> list[int]:
-        """Return the number of the episode of each segment, for an index int64 (B,)."""
-        return [number for number, _ in self._locate(split, index)]
+    def episodes(self, split: Split, index: Tensor) -> list[int] | None:
+        """See `SequenceSource.episodes`."""
+        found = [number for number, _ in self._locate(split, index)]
+        return None if len({*found}) == len(found) else found
 
     def _locate(self, split: Split, index: Tensor) -> Iterator[tuple[int, int]]:
         """Yield the number of the episode and the start of each segment."""
