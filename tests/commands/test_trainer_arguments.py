@@ -3,6 +3,7 @@
 import inspect
 import logging
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -167,18 +168,21 @@ def test_what_does_not_concern_the_updates_changes_no_weight(
     assert not [warning for warning in recwarn if "lightning" in warning.filename]
 
 
-@pytest.fixture
-def logged_to_stdout(capsys):
+@contextmanager
+def logged_to_stdout():
     """Lightning's own handler writes to what stderr was when it was imported."""
     handler = logging.StreamHandler(sys.stdout)
     logging.getLogger("lightning.pytorch").addHandler(handler)
-    yield
-    logging.getLogger("lightning.pytorch").removeHandler(handler)
+    try:
+        yield
+    finally:
+        logging.getLogger("lightning.pytorch").removeHandler(handler)
 
 
 @pytest.mark.parametrize(("argument", "value", "text"), PRINTS)
-def test_what_is_to_be_printed_is_printed(argument, value, text, tiny_config, in_tmp_path, capsys, logged_to_stdout):
-    assert main(["fit", "--config", str(tiny_config), f"--trainer.{argument}", value]) == 0
+def test_what_is_to_be_printed_is_printed(argument, value, text, tiny_config, in_tmp_path, capsys):
+    with logged_to_stdout():
+        assert main(["fit", "--config", str(tiny_config), f"--trainer.{argument}", value]) == 0
 
     assert text in capsys.readouterr().out
 

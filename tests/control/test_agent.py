@@ -157,8 +157,8 @@ def test_every_candidate_plan_is_tried_on_a_draw_of_its_own(trajectories):
     seen = torch.from_numpy(OBSERVATIONS)[None].expand(trajectories, -1, -1)  # (K, T, 3)
     filtered = model.filter(model.embed(seen), torch.zeros(trajectories, 6, 2))
     last = type(filtered)(*(values[:, -1:] for values in filtered))  # (K, 1, ...)
-    rollout, starts = model.rollout, []
-    model.rollout = lambda start, *others: [starts.append(start), rollout(start, *others)][1]
+    imagine, starts = model.imagine, []
+    model.imagine = lambda start, *others: [starts.append(start), imagine(start, *others)][1]
 
     follow_plan(model, lambda features: features.sum(-1), search())(last)
 

@@ -10,7 +10,7 @@ TESTS = Path(__file__).resolve().parents[1]
 
 def test_kills_are_resumed_and_bad_inputs_are_one_sentence():
     """It forks, and so has a process of its own, without the threads of this one."""
-    numbers = ["--kills", "20", "--inputs", "200", "--starts", "5", "--epochs", "30"]
+    numbers = ["--kills", "20", "--inputs", "60", "--starts", "5", "--epochs", "30"]
     command = [sys.executable, "-m", "faults", "--short", *numbers]
     path = os.pathsep.join(filter(None, [str(TESTS), os.environ.get("PYTHONPATH")]))
 

@@ -118,7 +118,7 @@ def _all_or_number(text: str) -> int:
 
 
 def require_effect(args: argparse.Namespace, agents: bool) -> None:
-    """Refuse options that would have no effect: those of scores for agents or of other scores, and those of episodes.
+    """Refuse options that would have no effect: those of scores for agents, and those of episodes for world models.
 
     Args:
         args: parsed options.
@@ -129,11 +129,6 @@ def require_effect(args: argparse.Namespace, agents: bool) -> None:
     """
     if args.checkpoint is not None and not args.runs:
         raise ForbesError("--checkpoint: is of a run, and none is named. Name the file as an argument of the --model")
-    unused = {*PASSES.values()} - {PASSES[name] for name in args.scores}
-    unused |= {"context"} - {"context" for name in args.scores if name == "open-loop"}
-    for name in () if agents else sorted(unused):
-        if getattr(args, name) != parser().get_default(name):
-            raise ForbesError(f"--{name}: no score of --scores {' '.join(args.scores)} uses it. Leave it out")
     of_scores = ("scores", "split", "sequences", "samples", "particles", "futures", "context", "batch_size", "data")
     for name in of_scores if agents else ("episodes", "acting_samples"):
         if getattr(args, name) != parser().get_default(name):

@@ -131,7 +131,7 @@ def test_integers_that_are_no_choices_are_refused(tmp_path):
     assert "action has 3 numbers a step, unlike that of the first episode" in refused(
         [pair, np.tile([[0, 2, 0]], (5, 1))]
     )
-    assert "its actions are float64 (2,), expected 2 integers" in refused([pair, pair / 2])
+    assert "its actions are float64 (2,), expected 2 integers" in refused([pair, pair / 4])
 
 
 def test_images_of_floats_are_refused(tmp_path):
