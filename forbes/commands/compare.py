@@ -126,8 +126,8 @@ def _is_measured(run: str, metrics: Mapping[str, str], seed: int) -> bool:
     record, checkpoint = read_record(run), open_checkpoint(RunFolder(run).checkpoint).sha256
     return all(
         (entry := record.get(metric, {})).get("checkpoint") == checkpoint
-        and entry["seed"] == seed
-        and entry["data"]["sha256"] == sha256
+        and entry.get("seed") == seed
+        and entry.get("data", {}).get("sha256") == sha256
         for metric, sha256 in metrics.items()
     )
 

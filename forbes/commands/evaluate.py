@@ -117,7 +117,7 @@ def _main(argv: Sequence[str]) -> None:
 
 def _tell_single_episode(measured: Sequence[EvaluatedRun]) -> None:
     """Print that standard errors are too small, where all sequences are parts of one episode."""
-    for entry in itertools.chain.from_iterable(evaluated.entries.values() for evaluated in measured[:1]):
+    for entry in measured[0].entries.values():  # all have the same sequences
         if len({*entry.get("episode_of", (0, 1))}) == 1:
             print(
                 f"all {entry['sequences']} sequences are parts of one episode: standard errors take them as "

@@ -298,7 +298,7 @@ def test_too_many_particles_for_memory_are_named_after_a_retry(runs, capsys):
 
 @pytest.mark.parametrize(("code", "left"), [("same", 1), ("another", 3)])
 def test_an_interrupted_evaluation_goes_on_where_it_stopped(runs, monkeypatch, code, left):
-    """By another commit it starts again: a score must be of the code that its record names."""
+    """By changed code it starts again: a score must be of the code that its record names."""
     monkeypatch.setattr("forbes.commands.evaluate.code_sha256", lambda: "same")
     evaluate(runs[0], "--batch-size", "5")
     whole, calls = record(runs[0])[NAME], []
